@@ -65,34 +65,6 @@ def deepest_function(kinds: frozenset[int], raycast: bool) -> Any:
     return deepest
 
 
-@cache
-def distance_kernel(kinds: frozenset[int], raycast: bool, mode: int, hysteresis: bool, walk: bool) -> Any:
-    """Return the kernel of SurfaceDistanceProbe. Dim [B, N]."""
-    deepest, emit = deepest_function(kinds, raycast), readout_functions(mode, hysteresis, walk, 1).emit
-
-    @wp.kernel(module="unique")
-    def surface_distance(
-        probes: ProbeArrays,
-        solids: SolidArrays,
-        pairs: PairArrays,
-        io: ReadoutArrays,
-        limits: wp.array(dtype=wp.float32),
-    ):
-        env, n = wp.tid()
-        if silenced(io, 1, env, n, probes.radius[n]):
-            return
-        part = probes.part[n]
-        probe = probes.probe[n]
-        best, _normal, place = deepest(probes, solids, pairs, env, n, wp.static(FAR))
-        d = wp.where(place >= 0, wp.min(best, limits[part]), limits[part])
-        signal = d
-        if wp.static(mode != CLEAN):
-            signal = d + radius_noise(io.knobs[part], env + io.env_offset, probe, io.age[env], io.episode[env])
-        emit(io, io.knobs[part], env, n, probe, d, signal)
-
-    return surface_distance
-
-
 @wp.func
 def latch(before: float, age: int, value: float, limits: wp.vec2f) -> float:
     """Apply the Schmitt trigger (4.3); a lost reading before counts as no contact."""
@@ -102,12 +74,16 @@ def latch(before: float, age: int, value: float, limits: wp.vec2f) -> float:
 
 
 @cache
-def depth_kernel(kinds: frozenset[int], raycast: bool, binary: bool, mode: int, hysteresis: bool, walk: bool) -> Any:
-    """Return the kernel of ContactDepthProbe (4.2) or, ``binary``, of ContactProbe (4.3). Dim [B, N]."""
+def probe_kernel(kinds: frozenset[int], raycast: bool, reads: str, mode: int, hysteresis: bool, walk: bool) -> Any:
+    """Return the kernel of probes that read a ``distance``, a ``depth`` (4.2) or a ``contact`` (4.3). Dim [B, N].
+
+    Its ``limits`` are the largest distance, or the depths beyond which contact begins and down to which it lasts.
+    """
     deepest, emit = deepest_function(kinds, raycast), readout_functions(mode, hysteresis, walk, 1).emit
+    distance, binary = reads == "distance", reads == "contact"
 
     @wp.kernel(module="unique")
-    def contact_depth(
+    def read_probes(
         probes: ProbeArrays,
         solids: SolidArrays,
         pairs: PairArrays,
@@ -122,15 +98,20 @@ def depth_kernel(kinds: frozenset[int], raycast: bool, binary: bool, mode: int, 
         probe = probes.probe[n]
         age = io.age[env]
         episode = io.episode[env]
-        best, _normal, place = deepest(probes, solids, pairs, env, n, 0.0)
+        best, _normal, place = deepest(probes, solids, pairs, env, n, wp.static(FAR if distance else 0.0))
         truth = wp.max(radius - best, 0.0)
+        if wp.static(distance):
+            truth = wp.where(place >= 0, wp.min(best, limits[part][0]), limits[part][0])
         signal = truth
         if wp.static(mode != CLEAN):
-            noisy = wp.max(radius + radius_noise(io.knobs[part], env + io.env_offset, probe, age, episode), 0.0)
-            # Radius noise (4.23) and gain (4.24) act before anything else of the measured branch; the truth sees
-            # neither.
-            fixed = episode_draw(io.knobs[part], env + io.env_offset, probe, episode)
-            signal = wp.max(noisy - best, 0.0) * fixed[0]
+            error = radius_noise(io.knobs[part], env + io.env_offset, probe, age, episode)
+            if wp.static(distance):
+                signal = truth + error
+            else:
+                # Radius noise (4.23) and gain (4.24) act before anything else of the measured branch; the truth sees
+                # neither.
+                fixed = episode_draw(io.knobs[part], env + io.env_offset, probe, episode)
+                signal = wp.max(wp.max(radius + error, 0.0) - best, 0.0) * fixed[0]
         if wp.static(binary):
             # Each branch latches on its own last bit (4.3): noise must not switch the true contact.
             truth = latch(io.truth[0, env, n], age, truth, limits[part])
@@ -141,4 +122,4 @@ def depth_kernel(kinds: frozenset[int], raycast: bool, binary: bool, mode: int, 
         else:
             emit(io, io.knobs[part], env, n, probe, truth, signal)
 
-    return contact_depth
+    return read_probes

@@ -7,13 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
-import numpy as np
-
 from brainbench.core.devices import warp
 from brainbench.core.errors import check_number
 from brainbench.core.limits import Limit, NotNegative, limited
 from robotics_bridge.physics.state import HandState
-from robotics_bridge.sensors.kernels.probe import depth_kernel, distance_kernel
+from robotics_bridge.sensors.kernels.probe import probe_kernel
 from robotics_bridge.sensors.noise.model import PROBE_KNOBS, TAXEL_KNOBS
 from robotics_bridge.sensors.runtime import ProbeRuntime, SuiteContext
 from robotics_bridge.sensors.sensor import QuerySensor
@@ -32,7 +30,7 @@ class SurfaceDistanceProbe(QuerySensor):
 
     units: ClassVar[str] = "m"
     knobs: ClassVar[frozenset[str]] = PROBE_KNOBS
-    runtime: ClassVar[str] = "robotics_bridge.sensors.probes.sensors:DistanceRuntime"
+    runtime: ClassVar[str] = "robotics_bridge.sensors.probes.sensors:SurfaceRuntime"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +39,7 @@ class ContactDepthProbe(QuerySensor):
 
     units: ClassVar[str] = "m"
     knobs: ClassVar[frozenset[str]] = TAXEL_KNOBS
-    runtime: ClassVar[str] = "robotics_bridge.sensors.probes.sensors:DepthRuntime"
+    runtime: ClassVar[str] = "robotics_bridge.sensors.probes.sensors:SurfaceRuntime"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +54,7 @@ class ContactProbe(QuerySensor):
 
     units: ClassVar[str] = "1"
     knobs: ClassVar[frozenset[str]] = TAXEL_KNOBS
-    runtime: ClassVar[str] = "robotics_bridge.sensors.probes.sensors:DepthRuntime"
+    runtime: ClassVar[str] = "robotics_bridge.sensors.probes.sensors:SurfaceRuntime"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -64,36 +62,23 @@ class ContactProbe(QuerySensor):
             check_number("release", self.release, least=0, most=self.threshold)
 
 
-class DistanceRuntime(ProbeRuntime):
-    """Serves surface-distance probes of one group."""
-
-    def __init__(self, sensors: Mapping[str, SurfaceDistanceProbe], context: SuiteContext) -> None:
-        super().__init__(sensors, 1, context, reach=None)
-        first = next(iter(sensors.values()))
-        self._kernel = distance_kernel(self.kinds, first.query == "raycast", self.mode, *self.stores)
-        self._limits = context.array([sensor.max_range for sensor in sensors.values()], float)
-
-    def run_kernels(self, state: HandState, dt: float) -> None:
-        """Run the kernels."""
-        c = self.context
-        inputs = [self.probes, c.solids.struct, c.pairs.struct, self.io]
-        self.launch(self._kernel, *inputs, self._limits)
+def _readout(sensor: QuerySensor) -> tuple[str, tuple[float, float]]:
+    """Return what a sensor reads, and the limits of :func:`probe_kernel`."""
+    if isinstance(sensor, SurfaceDistanceProbe):
+        return "distance", (sensor.max_range, 0.0)
+    if isinstance(sensor, ContactProbe):
+        return "contact", (sensor.threshold, sensor.threshold if sensor.release is None else sensor.release)
+    return "depth", (0.0, 0.0)
 
 
-class DepthRuntime(ProbeRuntime):
-    """Serves contact-depth probes, or contact probes, which are read as 0 or 1."""
+class SurfaceRuntime(ProbeRuntime):
+    """Serves distance, depth or contact probes of one group."""
 
-    def __init__(
-        self, sensors: Mapping[str, ContactDepthProbe] | Mapping[str, ContactProbe], context: SuiteContext
-    ) -> None:
-        super().__init__(sensors, 1, context)
-        first = next(iter(sensors.values()))
-        binary = isinstance(first, ContactProbe)
-        self._kernel = depth_kernel(self.kinds, first.query == "raycast", binary, self.mode, *self.stores)
-        limits = np.zeros((len(sensors), 2))
-        for row, sensor in zip(limits, sensors.values(), strict=True):
-            if isinstance(sensor, ContactProbe):
-                row[:] = sensor.threshold, sensor.threshold if sensor.release is None else sensor.release
+    def __init__(self, sensors: Mapping[str, QuerySensor], context: SuiteContext) -> None:
+        (reads, *_), limits = zip(*map(_readout, sensors.values()), strict=True)
+        super().__init__(sensors, 1, context, reach=None if reads == "distance" else 0.0)
+        raycast = next(iter(sensors.values())).query == "raycast"
+        self._kernel = probe_kernel(self.kinds, raycast, reads, self.mode, *self.stores)
         self._limits = context.array(limits, warp().vec2f)
 
     def run_kernels(self, state: HandState, dt: float) -> None:

@@ -27,7 +27,7 @@ from tests.factories.touch_scenes import BALL, GRID, pad_scene, poses_at, state_
 def test_sensors_of_one_class_share_a_launch_and_nothing_else_is_compiled() -> None:
     for factory in (kinematic.kinematic_kernel, proximity.proximity_kernel, dilation.marker_kernel):
         factory.cache_clear()
-    _probe_kernels.depth_kernel.cache_clear()
+    _probe_kernels.probe_kernel.cache_clear()
     mesh = Mesh([[0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
     aside = Geometry(name="aside", link="aside", kind="mesh", mesh=mesh)
     scene = pad_scene(BALL, aside)
@@ -36,7 +36,7 @@ def test_sensors_of_one_class_share_a_launch_and_nothing_else_is_compiled() -> N
     suite.update(state_of(scene, poses_at(4, {2: (0, 0, 0.0145), 3: (1, 0, 0)})))
     assert len(suite.runtimes) == 1
     assert _fields_and_trees(suite) == (0, 0)
-    assert _probe_kernels.depth_kernel.cache_info().currsize == 1
+    assert _probe_kernels.probe_kernel.cache_info().currsize == 1
     assert kinematic.kinematic_kernel.cache_info().currsize == 0
     assert proximity.proximity_kernel.cache_info().currsize == 0
     assert dilation.marker_kernel.cache_info().currsize == 0
