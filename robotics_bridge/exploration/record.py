@@ -112,11 +112,8 @@ class Explored:
     """Held so much further away than the procedure says (m)."""
 
     def __post_init__(self) -> None:
-        if not float(np.linalg.norm(self.quaternion)) > 1e-6:
-            raise UsageError(
-                f"The orientation of {self.label!r} is a quaternion (w, x, y, z) that is not zero; received "
-                f"{self.quaternion!r}."
-            )
+        length = float(np.linalg.norm(self.quaternion))
+        check_number(f"length of the quaternion of {self.label!r}", length, above=1e-6)
         extent = float(np.max(self.geometry.reach(np.concatenate([np.eye(3), -np.eye(3)]))))
         check_number(f"extent of {self.label!r} from its origin (m)", extent, most=1)
 

@@ -115,7 +115,7 @@ def test_objects_are_held_in_some_way(value) -> None:
         turned[place] = value
         with pytest.raises(UsageError, match="quaternion of an explored object"):
             _box(quaternion=tuple(turned))
-    with pytest.raises(UsageError, match="'box' is a quaternion"):
+    with pytest.raises(UsageError, match="quaternion of 'box'"):
         _box(quaternion=(0, 0, 0, 0))
     with pytest.raises(UsageError, match=rf"retreat .*received {value}"):
         _box(retreat=value)
