@@ -293,9 +293,9 @@ def doubts_of(model: Any, links: Sequence[str], jammed: Pairs) -> tuple[str, ...
         )
     if (mass := float(sum(model.body(link).mass[0] for link in links))) > _HEAVIEST:
         doubts.append(f"palm and fingers weigh {mass:.3g} kg: masses are in kg")
-    if own := sorted(" and ".join(pair) for pair in jammed if {*pair} <= {*links}):
+    if stuck := sorted(" and ".join(pair) for pair in jammed if {*pair} <= {*links}):
         doubts.append(
-            f"{listing(own)} lie more than {1e3 * _DEEPEST:g} mm in each other at rest and push each other: exclude "
+            f"{listing(stuck)} lie more than {1e3 * _DEEPEST:g} mm in each other at rest and push each other: exclude "
             "their collision"
         )
     return tuple(doubts)
