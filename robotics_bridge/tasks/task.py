@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from brainbench.core.errors import UsageError, brief, check_each, check_name, check_number, check_numbers
-from brainbench.core.limits import Count, Limit, NotNegative, Positive, limited
+from brainbench.core.errors import UsageError, check_each, check_name, check_number, check_numbers
+from brainbench.core.limits import Count, Limit, NotNegative, Positive, check_value, limited
 from brainbench.core.rotations import TURN
 from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.goals import Goal
@@ -30,6 +30,7 @@ from robotics_bridge.tasks.terms import TaskScene, TaskState
 
 _Angle = Annotated[float, Limit(least=-math.pi / 2, most=math.pi / 2, unit="rad")]
 _Turn = Annotated[float, Limit(least=-TURN, most=TURN, unit="rad")]
+_Slide = tuple[Range, NotNegative, NotNegative, NotNegative]
 Pose = tuple[tuple[float, float, float], tuple[float, float, float, float]]
 """Position (m) and quaternion (w, x, y, z)."""
 
@@ -200,7 +201,7 @@ class Task:
     """Beginnings of the names of fingers that the policy moves; empty: all. The others are held."""
     furniture: Callable[[Any], None] | None = None
     """Adds fixed things to the ``mujoco.MjSpec`` of the scene."""
-    carriage: Mapping[str, tuple[Range, float, float, float]] = field(default_factory=dict)
+    carriage: Mapping[str, _Slide] = field(default_factory=dict)
     """Slides that carry the palm: world axis (x, y, z) → range [m], stiffness [N/m], damping [N·s/m], effort [N]."""
     carriage_speed: Positive = 0.5
     """How fast targets of the slides move at most, where ``rated_speed`` holds [m/s]."""
@@ -290,13 +291,9 @@ class Task:
         for hand, joints in self.joints.items():
             for joint, position in joints.items():
                 check_number(f"joint {joint!r} of {hand!r} {of} (rad)", position)
-        for axis, (span, *numbers) in self.carriage.items():
+        for axis, slide in self.carriage.items():
             check_name(f"axis of the carriage {of}", axis, ("x", "y", "z"))
-            check_numbers(f"carriage.{axis} {of}", span, 2)
-            if span[0] > span[1]:
-                raise UsageError(f"carriage.{axis} {of} is a range (low, high); received {brief(span)}.")
-            for name, number in zip(("stiffness", "damping", "effort"), numbers, strict=True):
-                check_number(f"{name} of carriage.{axis} {of}", number, least=0)
+            check_value(f"carriage.{axis} {of}", slide, _Slide)
 
     @property
     def step_dt(self) -> float:
