@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import torch
 from torch import nn
@@ -29,7 +29,8 @@ from torch.nn import functional
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
 from brainbench.core.devices import torch_device
-from brainbench.core.errors import UsageError, check_name, check_number
+from brainbench.core.errors import UsageError, check_name
+from brainbench.core.limits import Limit, limited
 from brainbench.models.network import Normaliser
 
 LAST_COLUMNS = (4, 4, 6, 6, 5)
@@ -41,21 +42,18 @@ _MIRRORED = {"vertical": "z", "horizontal": "y"}
 
 
 @dataclass(frozen=True)
+@limited(of="{} of an augmentation")
 class Augmentation:
     """Change of every sample at training time."""
 
-    kind: str = "none"
+    kind: Literal["none", "physical", "thesis", "image"] = "none"
     """``none``, ``physical``, ``thesis`` or ``image``."""
-    masking: float = 0.0
+    masking: Annotated[float, Limit(least=0, below=1)] = 0.0
     """Share of the time steps that are set to zero (temporal masking; published with 0.75)."""
     cells: tuple[int, ...] = MOUSE
     """Cells of the grid that hold a whisker in these data, ascending; ``physical`` keeps to them."""
     axes: str = "world"
     """``world`` or ``follicle``: axes of forces and moments, which ``physical`` mirrors."""
-
-    def __post_init__(self) -> None:
-        check_name("augmentation", self.kind, KINDS)
-        check_number("The share of masked time steps", self.masking, least=0, below=1)
 
     def __call__(self, x: torch.Tensor, generator: torch.Generator, *, part: tuple[int, int] = (0, 1)) -> torch.Tensor:
         """Return an augmented copy of sweeps [B, T, S·C, 5, 7] in SI.

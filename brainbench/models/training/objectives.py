@@ -21,12 +21,11 @@ from torch.nn import functional
 from torch.optim import Optimizer
 
 from brainbench.core.devices import record_step
-from brainbench.core.errors import UsageError, check_name, check_number
+from brainbench.core.errors import UsageError
 from brainbench.models.cells import Cell, GatedCell
 from brainbench.models.encoders import BasicBlock, GPTBlock, MambaBlock, S4Block
 from brainbench.models.ops.layers import copy_named
 from brainbench.models.parts import AutoencoderHead, SimCLRHead, SimSiamHead
-from brainbench.models.recipes import OPTIMIZERS, SCHEDULES
 
 TEMPERATURE = 0.1
 RECONSTRUCTION_WEIGHT = 0.5
@@ -167,7 +166,6 @@ LEARNERS = {"supervised": Supervised, "simclr": SimCLR, "simsiam": SimSiam, "ae"
 
 def make_learner(objective: str, model: nn.Module) -> Learner:
     """Join a network and an objective by name."""
-    check_name("objective", objective, LEARNERS)
     return LEARNERS[objective](model)
 
 
@@ -233,8 +231,6 @@ _MAKERS: Mapping[str, Callable[..., Optimizer]] = {
 
 def make_optimizer(name: str, parameters: Iterable[nn.Parameter], learning_rate: float) -> Optimizer:
     """Build an optimiser by name over the parameters that want a gradient."""
-    check_name("optimizer", name, OPTIMIZERS)
-    check_number("learning_rate", learning_rate, above=0)
     return _MAKERS[name]([p for p in parameters if p.requires_grad], learning_rate)
 
 
@@ -243,7 +239,6 @@ def rate_factor(schedule: str, epoch: float, *, epochs: int, warmup_epochs: int 
 
     For ``cosine`` fractions of an epoch count, and ``warmup_epochs`` of linear rise from 1e-4.
     """
-    check_name("schedule", schedule, SCHEDULES)
     if schedule == "constant":
         return 1.0
     if schedule == "step":
