@@ -110,8 +110,6 @@ def with_sizes(shapes: Sequence[ObjectShape], span: tuple[float, float]) -> tupl
     """
     if span == (1.0, 1.0):
         return tuple(shapes)
-    if not 0 < span[0] <= span[1]:
-        raise UsageError(f"Factors of size are a positive range (low, high); received {span}.")
     factors = [span[0] + (span[1] - span[0]) * index / 7 for index in range(8)]
     count, round_ = len(shapes), math.lcm(len(shapes), 8)
     # Every pair once: after as many as repeat the first pair, sizes go one further.
