@@ -17,7 +17,7 @@ import logging
 import math
 import os
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -230,9 +230,10 @@ def _part_of(part: Any, unroll: Any) -> Any:
 SUFFIXES = {"onnx": ".onnx", "torch": ".pt2"}  # formats and their suffixes: ONNX, and an exported PyTorch program
 INPUTS, OUTPUTS = ("obs", "h_in"), ("features", "h_out")
 OPSET = 18
+BATCH = {0: torch.export.Dim("batch", min=1, max=8192)}  # an input with any number of rows
 MOST_ONNX = 2 << 30  # bytes of an ONNX file, which Protocol Buffers allow
 MOST_INPUT = 1 << 26  # numbers of one input
-TOLERANCE = 1e-4  # largest difference between the file and the network, relative to the largest feature
+TOLERANCE = 1e-4  # largest difference between a file and what was exported, relative to the largest number it gives
 _STEPS = 8
 _SOUND: set[str] = set()  # hashes of ONNX files that were tried in this process
 
@@ -264,19 +265,14 @@ def export_model(model: nn.Module, path: str | Path, *, format: str = "onnx", na
     from brainbench.models.ops.layers import weights_hash
 
     check_name("export format", format, SUFFIXES)
-    if format == "onnx":
-        require_onnx()
     target = Path(path)
     target = target if target.suffix else target.with_suffix(SUFFIXES[format])
     step = StreamingStep(copy.deepcopy(model).cpu().float().eval()).eval()
     with atomic_path(target) as temporary:
-        _write(step, temporary, format)
+        example = torch.zeros(2, *step.model.spec.input_shape), step.init_state(2)
+        write_step(step, example, temporary, format, (BATCH, BATCH))
         difference = _difference(step, READERS[format](temporary))
-        if not difference <= TOLERANCE:
-            raise DataError(
-                f"The exported file differs from the network by {difference:.2g} of the largest feature (allowed "
-                f"{TOLERANCE:g}), so it was not kept."
-            )
+        check_difference(difference, "network", "feature")
     spec: Any = model.spec
     contract = {
         "model": name or type(model).__name__,
@@ -298,6 +294,15 @@ def export_model(model: nn.Module, path: str | Path, *, format: str = "onnx", na
     return Export(target, file, format, step.state_size, step.model.features, difference)
 
 
+def check_difference(difference: float, of: str, largest: str) -> None:
+    """Raise DataError where a file gives something else than what was exported, as a share of the ``largest``."""
+    if not difference <= TOLERANCE:
+        raise DataError(
+            f"The exported file differs from the {of} by {difference:.2g} of the largest {largest} (allowed "
+            f"{TOLERANCE:g}), so it was not kept."
+        )
+
+
 def require_onnx() -> None:
     """Raise :class:`MissingDependencyError` unless files of ONNX can be written and read."""
     for package in ("onnx", "onnxscript", "onnxruntime"):
@@ -307,10 +312,13 @@ def require_onnx() -> None:
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
 
 
-def _write(step: Any, path: Path, format: str) -> None:
-    example = torch.zeros(2, *step.model.spec.input_shape), step.init_state(2)
-    batch = torch.export.Dim("batch", min=1, max=4096)
-    shapes: dict[str, Any] = {"dynamic_shapes": ({0: batch}, {0: batch})}
+def write_step(
+    step: Any, example: tuple[torch.Tensor, ...], path: Path, format: str, shapes: Any, inputs: Sequence[str] = INPUTS,
+    outputs: Sequence[str] = OUTPUTS,
+) -> None:  # fmt: skip
+    """Write a module with names of what it takes and gives; ``shapes`` say of what it takes which axes vary."""
+    if format == "onnx":
+        require_onnx()
     # PyTorch's compiler looks for a folder for temporary files.
     with temporary_folder(), warnings.catch_warnings(), torch.no_grad():
         # The exporters warn of their own parts' deprecations, which nobody here can act on.
@@ -318,11 +326,11 @@ def _write(step: Any, path: Path, format: str) -> None:
         if format == "torch":
             # Into memory: PyTorch writes the name of a file into it, and ends the process where the disk is full.
             content = io.BytesIO()
-            torch.export.save(torch.export.export(step, example, **shapes), content)
+            torch.export.save(torch.export.export(step, example, dynamic_shapes=shapes), content)
             path.write_bytes(content.getvalue())
             return
-        names: dict[str, Any] = {"input_names": list(INPUTS), "output_names": list(OUTPUTS)}
-        program = torch.onnx.export(step, example, dynamo=True, opset_version=OPSET, verbose=False, **names, **shapes)
+        names: dict[str, Any] = {"input_names": list(inputs), "output_names": list(outputs), "dynamic_shapes": shapes}
+        program = torch.onnx.export(step, example, dynamo=True, opset_version=OPSET, verbose=False, **names)
     if program is None:
         raise DataError("PyTorch gave no ONNX program for this network.")
     program.save(str(path), external_data=False)

@@ -6,7 +6,6 @@ A file is tried before it is kept, and before it may move anything.
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,9 +17,8 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import BrainbenchError, DataError
 from brainbench.core.files import atomic_path, file_hash, provenance, write_json
-from brainbench.core.reading.regular import temporary_folder
 from brainbench.models.activations import evaluating
-from brainbench.models.export import onnx_session, require_onnx
+from brainbench.models.export import BATCH, check_difference, onnx_session, require_onnx, write_step
 from robotics_bridge.policies.contract import MOST_NUMBERS, check_contract
 from robotics_bridge.policies.student import TactilePolicy
 
@@ -77,7 +75,6 @@ class _OnnxRunner:
         return np.asarray(actions)[0]
 
 
-TOLERANCE = 1e-4  # largest difference of an action between file and policy, relative to the largest action
 STEPS = 60  # steps of the comparison; rows are reset on the way
 
 
@@ -118,36 +115,16 @@ def export_policy(
         "provenance": provenance(),
     }
     check_contract(contract, target.name)
-    with temporary_folder(), atomic_path(target) as temporary, warnings.catch_warnings():
-        # The exporters warn of their own parts' deprecations, which nobody here can act on.
-        warnings.simplefilter("ignore")
-        _write(policy, temporary)
+    step: Any = policy.as_onnx()
+    shapes = (tuple(BATCH for _ in step.input_names),)
+    with atomic_path(target) as temporary:
+        write_step(step, step.get_dummy_inputs(2), temporary, "onnx", shapes, step.input_names, step.output_names)
         # What the policy reads counts, not what the exported part says of itself.
         difference = compare(policy, read_policy(temporary, policy.shapes))
-        if not difference <= TOLERANCE:
-            raise DataError(
-                f"The exported file differs from the policy by {difference:.2g} of the largest action (allowed "
-                f"{TOLERANCE:g}), so it was not kept."
-            )
+        check_difference(difference, "policy", "action")
     contract |= {"difference": difference, "sha256": file_hash(target, length=64)}
     file = write_json(target.with_name(f"{target.name}.json"), contract)
     return PolicyExport(target, file, policy.core.state_size, difference)
-
-
-def _write(policy: TactilePolicy, path: Path) -> None:
-    """Write one step of a policy as ONNX, for any number of rows."""
-    require_onnx()
-    step: Any = policy.as_onnx()
-    batch = torch.export.Dim("batch", min=1, max=8192)
-    names = step.input_names
-    with torch.no_grad():
-        program = torch.onnx.export(
-            step, step.get_dummy_inputs(2), dynamo=True, opset_version=18, input_names=names,
-            output_names=step.output_names, dynamic_shapes=(tuple({0: batch} for _ in names),), verbose=False,
-        )  # fmt: skip
-    if program is None:
-        raise DataError("PyTorch gave no ONNX program for this policy.")
-    program.save(str(path), external_data=False)
 
 
 def compare(policy: TactilePolicy, run: Runner) -> float:

@@ -194,12 +194,13 @@ def test_an_exported_program_computes_what_the_network_does(name, tmp_path):
 def test_a_full_disk_is_an_error_and_not_the_end_of_the_process():
     # PyTorch's own writer of files ends the process where it cannot finish one.
     step = StreamingStep(load_model("zhuang-small").eval()).eval()
+    example = torch.zeros(2, *step.model.spec.input_shape), step.init_state(2)
     with pytest.raises(OSError, match="No space left"):
-        export._write(step, Path("/dev/full"), "torch")
+        export.write_step(step, example, Path("/dev/full"), "torch", (export.BATCH, export.BATCH))
 
 
 def test_a_file_that_differs_is_not_kept(tmp_path, monkeypatch):
-    monkeypatch.setattr(export, "_write", lambda step, path, format: None)
+    monkeypatch.setattr(export, "write_step", lambda *given: None)
     monkeypatch.setitem(export.READERS, "torch", lambda path: lambda obs, h: (np.zeros((len(obs), 96)), h))
     with pytest.raises(DataError, match=r"by 1 .*0\.0001"):
         export_model(load_model("resnet18-small"), tmp_path / "model.pt2", format="torch")
