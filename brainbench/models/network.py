@@ -14,8 +14,8 @@ import torch
 from torch import nn
 
 from brainbench.core.contracts import CHANNELS, SUB_STEP_SECONDS, SUB_STEPS
-from brainbench.core.errors import UsageError, check_each, check_name, check_number
-from brainbench.models.graph.spec import UNROLLS, Unroll
+from brainbench.core.errors import UsageError, check_each, check_number
+from brainbench.models.graph.spec import Unroll
 from brainbench.models.graph.temporal_graph import TemporalGraph
 from brainbench.models.parts import AllStepsDecoder, Attender, Encoder, make_decoder
 
@@ -119,7 +119,6 @@ class EncoderAttenderDecoder(nn.Module):
         unroll: Unroll = "biological",
     ) -> None:
         super().__init__()
-        check_name("unrolling", unroll, UNROLLS)
         field, latency = encoder.receptive_field, encoder.latency
         self._unroll: dict[str, Any] = {}
         if isinstance(encoder, TemporalGraph):

@@ -18,7 +18,6 @@ from brainbench.core.limits import Count, Limit, Share, limited
 Shape = tuple[int, ...]
 Unroll = Literal["biological", "full"]
 UNROLLS: tuple[Unroll, ...] = ("biological", "full")
-MEMORIES = ("time-decay", "ugrnn", "intersection", "gru", "lstm")
 Sizes = tuple[Count, Count]
 """Rows, columns."""
 Margins = tuple[Annotated[int, Limit(least=0)], Annotated[int, Limit(least=0)]]
@@ -91,8 +90,7 @@ class Dense(Operation):
 class Memory:
     """A recurrent cell of :mod:`brainbench.models.cells`, channels unchanged."""
 
-    kind: str = "time-decay"
-    """One of :data:`MEMORIES`."""
+    kind: Literal["time-decay", "ugrnn", "intersection", "gru", "lstm"] = "time-decay"
     kernel_size: Sizes = (2, 2)
     """Kernel of the gates, rows and columns."""
     layer_norm: bool = False
@@ -101,9 +99,6 @@ class Memory:
     """Initial time decay; other kinds ignore it."""
     trainable: bool = True
     """Let training change the time decay; other kinds ignore it."""
-
-    def __post_init__(self) -> None:
-        check_name("memory", self.kind, MEMORIES)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from brainbench.core.reading.regular import readable
 from brainbench.core.reading.texts import read_json, read_mapping
 from brainbench.models.graph.spec import Convolution, Dense, Edge, GraphSpec, Memory, Node, Operation, Pool
 
-_MEMORIES = {
+_MEMORIES: dict[str, Any] = {
     "TimeDecayRecurrentCell": "time-decay",
     "UGRNNCell": "ugrnn",
     "IntersectionRNNCell": "intersection",
