@@ -102,11 +102,11 @@ def cast_grid(
     middle, half = (low + high) / 2, (high - low) / 2 * extent
     x = middle[0] + (np.linspace(-1, 1, columns) if columns > 1 else np.zeros(1)) * half[0]
     y = middle[1] + (np.linspace(-1, 1, rows) if rows > 1 else np.zeros(1)) * half[1]
-    start = high[2] + 0.01
+    start, data, geoms = high[2] + 0.01, mujoco.MjData(model), geoms_of(model, body)
     position, normal, radii = np.zeros((rows * columns, 3)), np.tile(up, (rows * columns, 1)), np.zeros(rows * columns)
     for index, (row, column) in enumerate(np.ndindex(rows, columns)):
         origin = x[column] * u + y[row] * v + start * up
-        hit = _nearest(model, geoms_of(model, body), origin, -up)
+        hit = _nearest(model, data, geoms, origin, -up)
         position[index] = origin - up * (hit[0] if hit else start)
         if hit:
             normal[index], radii[index] = hit[1], radius
@@ -115,9 +115,10 @@ def cast_grid(
     return Probes(position, normal, radii, (rows, columns))
 
 
-def _nearest(model: Any, geoms: list[int], origin: NDArray, direction: NDArray) -> tuple[float, NDArray] | None:
+def _nearest(
+    model: Any, data: Any, geoms: list[int], origin: NDArray, direction: NDArray
+) -> tuple[float, NDArray] | None:
     """Return distance and surface normal where a ray first meets one of the geometries (body's frame)."""
-    data = mujoco.MjData(model)
     best: tuple[float, NDArray] | None = None
     for geom in geoms:
         matrix, normal = to_matrices(model.geom_quat[geom]).ravel(), np.zeros(3)
