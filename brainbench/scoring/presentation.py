@@ -3,8 +3,8 @@
 Where stimuli were presented in blocks, slow changes of rates tell them apart without any tuning, alike in random halves
 of the trials and in all animals that had the same order. So the times of presentation are scored as if they were a
 model, with every animal's own times. Where stimulus and time are confounded in some session, a score counts only if
-the times explain nothing. Where responses drift within sessions, random halves agree better than halves by time do, and
-a score counts only if the reliability of these reaches the gate too.
+the times explain nothing. Where responses drift within sessions, or noise lasts from trial to trial, random parts agree
+better than parts by time do, and a score counts only if the reliability of these reaches the gate too.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Presentation:
     @property
     def _drifts(self) -> str:
         assert self.within is not None
-        times = f"halves by time have a reliability of {self.within.by_time:.2f}, random ones {self.within.random:.2f}"
+        times = f"parts by time have a reliability of {self.within.by_time:.2f}, random ones {self.within.random:.2f}"
         return f"responses drift within sessions: {times} (p = {self.within.p:.2g})"
 
     @property

@@ -12,7 +12,8 @@ to find, so report it with the score.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
+from dataclasses import replace
+from itertools import combinations, pairwise
 
 import numpy as np
 
@@ -66,6 +67,28 @@ class SplitRDMs:
         # Both at once, since what takes time does not grow with the number of halves.
         rdms = self._from_patterns([np.concatenate([member, 1.0 - member]) for member in members])
         return rdms[: len(rdms) // 2], rdms[len(rdms) // 2 :]
+
+    def crossed(self, parts: list[Ints]) -> Floats:
+        """Return the RDMs [6, N, P] of products of differences between stimuli in two of four parts of the trials.
+
+        ``parts`` are the numbers [N, R] of the parts in each session; their pairs come in order. Noise that no two
+        parts share is on average in none.
+        """
+        pairs, total, number = [*combinations(range(4), 2)], 0.0, 0.0
+        for session, numbers in zip(self._sessions, parts, strict=True):
+            # The factor has the products of the responses in fewer columns.
+            part = replace(session, responses=session.factor) if session.complete else session
+            for units in part.slices():
+                members = np.concatenate([(numbers == index) * 1.0 for index in range(4)])
+                means = np.split(mean_patterns(part, members, self._count, variances=False, units=units)[0], 4)
+                sides = np.stack([means[a] for a, _ in pairs]), np.stack([means[b] for _, b in pairs])
+                both = np.array(float(means[0].shape[-1]))
+                if not session.complete:
+                    present = np.isfinite(sides[0] + sides[1]) * 1.0
+                    both = upper(present @ present.swapaxes(-1, -2))
+                distances = dissimilarity.product_distances(*sides, missing=not session.complete)
+                total, number = total + np.where(both > 0, distances * both, 0.0), number + both
+        return np.divide(total, number, out=np.full(np.shape(total), np.nan), where=number > 0)
 
     def _summed(self, members: list[Floats]) -> list[_Sums]:
         return [_Sums(*each, self._count) for each in zip(self._sessions, members, strict=True)]
@@ -126,9 +149,6 @@ class SplitRDMs:
             with np.errstate(invalid="ignore", divide="ignore"):
                 noise = upper((summed + np.swapaxes(summed, -1, -2)) / shared)
                 return dissimilarity.product_distances(seen, seen, missing=True) - noise, both
-        if self._method == "poisson":
-            rates = dissimilarity.poisson_rates(patterns)
-            return dissimilarity.product_distances(rates, np.log(rates), missing=True), both
         return dissimilarity.product_distances(patterns, patterns, missing=True), both
 
 
@@ -200,21 +220,9 @@ def members(random: Hashes) -> Floats:
     return member
 
 
-def split_members(session: SortedTrials, index: Ints, seed: int) -> Floats:
-    """Return 1 for the trials [S, R] in the first half of their stimulus, in the splits ``index`` [S]."""
-    return first_halves(draws(session.hashes, index, seed), session)
-
-
-def time_members(session: SortedTrials) -> Floats:
-    """Return 1 for the earlier trials [1, R] of each stimulus; an odd trial goes to either half by its hash."""
-    places = np.argsort(np.argsort(session.times, kind="stable")).astype(np.uint64)
-    return first_halves((places[None] << np.uint64(1)) | (session.hashes & np.uint64(1)), session)
-
-
-def first_halves(random: Hashes, session: SortedTrials) -> Floats:
-    """Return 1 for the lower half of the numbers [S, R] of each stimulus' trials, and of those with the same units."""
-    if len(session.groups):
-        random = _by_groups(random, session.groups)
+def split_members(session: SortedTrials, index: Ints | None, seed: int) -> Floats:
+    """Return 1 for the trials [S, R] in the first half of their stimulus: in the splits ``index``, or in time."""
+    random = _numbers(session, index, seed)
     first = np.empty(random.shape)
     sizes = np.bincount(session.labels)[session.labels]
     # Trials are sorted by stimulus; stimuli with as many trials are drawn in one call.
@@ -224,8 +232,35 @@ def first_halves(random: Hashes, session: SortedTrials) -> Floats:
     return first
 
 
+SHIFTS = 4  # ways in which trials in order are divided into quarters, each a sixteenth further on than the last
+
+
+def quarters(session: SortedTrials, index: Ints | None, seed: int, shift: int) -> Ints:
+    """Return the quarter 0 to 3 of its stimulus that each trial [S, R] is in; of fewer than four some are empty."""
+    random = _numbers(session, index, seed)
+    result, sizes = np.empty(random.shape, dtype=np.int64), np.bincount(session.labels)
+    places, number = np.arange(len(session.labels)) - np.repeat(np.cumsum(sizes) - sizes, sizes), sizes[session.labels]
+    order = np.lexsort((random, np.broadcast_to(session.labels, random.shape)))
+    quarter = (4 * SHIFTS * places + shift * number) // (SHIFTS * number) % 4
+    np.put_along_axis(result, order, quarter[None], axis=-1)
+    return result
+
+
+def _numbers(session: SortedTrials, index: Ints | None, seed: int) -> Hashes:
+    """Return numbers [S, R] by which trials are divided, those with the same units alike.
+
+    They are random in each split, or the order in time, whose last bit is a coin.
+    """
+    if index is None:
+        places = np.argsort(np.argsort(session.times, kind="stable")).astype(np.uint64)
+        random = (places[None] << np.uint64(1)) | (session.hashes & np.uint64(1))
+    else:
+        random = draws(session.hashes, index, seed)
+    return _by_groups(random, session.groups) if len(session.groups) else random
+
+
 def _by_groups(random: Hashes, groups: Ints) -> Hashes:
-    """Return numbers [S, R] in whose lower half of a stimulus is the lower half of each of its groups."""
+    """Return numbers [S, R] in whose lower part of a stimulus is the lower part of each of its groups."""
     sizes = np.bincount(groups)
     ranks = np.arange(len(groups)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
     shares, order = np.empty(random.shape), np.lexsort((random, np.broadcast_to(groups, random.shape)))

@@ -9,7 +9,9 @@ How a perfect model would score is found from the animal without its noise: resp
 the means that trials tell, have the eigenvalues that were observed.
 
 Where responses to a stimulus stay what they are, the halves of its trials by time agree as random halves do; the same
-holds of earlier and later sessions. If few random halves agree as little, the responses drift.
+holds of earlier and later sessions. If few random halves agree as little, the responses drift. Noise that neighbours in
+time share is no response either. In a sequence that repeats it makes stimuli that follow one another alike, in halves
+by time too, but not in products between quarters, which share less in time than at random then.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import Trials, natural_key
-from brainbench.core.errors import DataError, UsageError, check_name, check_number
+from brainbench.core.errors import UsageError, check_name, check_number
 from brainbench.core.records import Interval
 from brainbench.metrics.arrays import Floats, Ints, finite_mean
 from brainbench.metrics.rdms.comparison import (
@@ -37,12 +39,13 @@ from brainbench.metrics.rdms.comparison import (
     stimulus_count,
 )
 from brainbench.metrics.rdms.dissimilarity import NOISE_METHODS, RDM_METHODS
-from brainbench.metrics.reliability.halves import SplitRDMs, half_rdms, time_members
+from brainbench.metrics.reliability.halves import SHIFTS, SplitRDMs, half_rdms, quarters, split_members
 from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE, spearman_brown
 from brainbench.metrics.reliability.sessions import SortedTrials, shifted_sessions, usable_sessions, whitened_sessions
 from brainbench.metrics.stimulus_labels import membership, stimulus_means
 
 SPLITS = 1000  # random split halves per animal
+_QUARTERS = 40  # divisions of the trials into random quarters, with which quarters in time are compared
 
 FEWEST_SESSIONS = 3  # sessions of an animal from which their order can be told from chance
 
@@ -95,6 +98,8 @@ class SubjectRDM:
     """Session → times [R] and stimuli [R] of its trials, in the order of sessions; those without times are left out."""
     by_time: float = math.nan
     """Comparison of the RDMs of the earlier and the later half of each session's trials; NaN without times."""
+    apart: Floats = field(default_factory=lambda: np.empty(0), repr=False)
+    """[1 + S″] what four quarters of the trials share: in time (the first), and at random; empty without times."""
     between: Floats = field(default_factory=lambda: np.empty((0, 0)), repr=False)
     """[S, S] comparisons of the RDMs of single sessions, in order; empty below :data:`FEWEST_SESSIONS`."""
     nuisances: Mapping[str, Floats] = field(default_factory=dict, repr=False)
@@ -189,16 +194,13 @@ def subject_rdm(
     )
     if problem is not None:
         return empty
-    if method == "poisson" and any((session.responses < 0).any() for session in sessions):
-        raise DataError("method='poisson' needs rates or counts, which are never negative; some responses are.")
     # Trials without noise covariance left make squared distances Mahalanobis distances.
     distance = "sqeuclidean" if method == "mahalanobis" else method
     patterns, variances = _mean_responses(sessions, n_stimuli)
-    if distance != "poisson":
-        sessions = shifted_sessions(sessions, n_stimuli, by_unit=distance != "correlation")
+    sessions = shifted_sessions(sessions, n_stimuli, by_unit=distance != "correlation")
     rdm = SplitRDMs(sessions, n_stimuli, distance).whole()
     halves, r, signal = _split_halves(sessions, n_stimuli, distance, comparison, splits, seed, rdm)
-    signal |= _in_time(sessions, n_stimuli, distance, comparison)
+    signal |= _in_time(sessions, n_stimuli, distance, comparison, seed)
     animal = replace(empty, rdm=rdm, split_half_r=r, halves=halves, patterns=patterns, noise=variances, **signal)
     finite = r[np.isfinite(r)]
     if not np.isfinite(rdm).all() or not finite.size:
@@ -253,8 +255,8 @@ def _split_halves(
     return halves, r, parts
 
 
-def _in_time(sessions: list[SortedTrials], count: int, method: str, comparison: str) -> dict[str, Any]:
-    """Return what an animal keeps of times: of its trials, the agreement of halves by time, and of its sessions."""
+def _in_time(sessions: list[SortedTrials], count: int, method: str, comparison: str, seed: int) -> dict[str, Any]:
+    """Return what an animal keeps of times: of its trials, the agreement of quarters in time, and of its sessions."""
     ordered = sorted(sessions, key=lambda session: natural_key(session.session))
     by_name = {session.session or str(place): session for place, session in enumerate(ordered)}
     names = {name for session in sessions for name in session.columns}
@@ -266,14 +268,35 @@ def _in_time(sessions: list[SortedTrials], count: int, method: str, comparison: 
         },
     }
     if all(session.times is not None for session in sessions):
-        first, second = SplitRDMs(sessions, count, method).halves([time_members(each) for each in sessions])
+        first, second = SplitRDMs(sessions, count, method).halves([split_members(each, None, 0) for each in sessions])
         stated["by_time"] = float(compare(first, second, method=comparison)[0])
+        # Few at once, so that memory does not grow with the stimuli; of many pairs few are enough.
+        number = max(_QUARTERS // 4, _QUARTERS * 40 // max(count, 40))
+        step = max(1, _CHUNK_BYTES // (48 * count * max(count, *(min(part.responses.shape) for part in sessions))))
+        index = [None, *(np.arange(start, min(start + step, number)) for start in range(0, number, step))]
+        stated["apart"] = np.concatenate([_shared(sessions, count, comparison, part, seed) for part in index])
     if len(ordered) >= FEWEST_SESSIONS:
         rdms = np.stack([SplitRDMs([each], count, method).whole() for each in ordered])
         # A session whose units are silent for some stimulus has no RDM of its own, and says nothing.
         rdms = rdms[~is_flat(rdms)]
         stated["between"] = compare(rdms[:, None], rdms[None], method=comparison)
     return stated
+
+
+def _shared(sessions: list[SortedTrials], count: int, comparison: str, index: Ints | None, seed: int) -> Floats:
+    """Return the product [S] of RDMs that are crossed between two quarters and the other two, over that of all trials.
+
+    No two of the four sides have a trial in common, so the only noise in it is what trials share. Quarters in time do
+    not share what neighbours do.
+    """
+    comparison = comparison if comparison in LINEAR else "pearson"
+    every, shared = SplitRDMs(sessions, count, "sqeuclidean"), 0.0
+    for shift in range(SHIFTS):
+        crossed = every.crossed([quarters(each, index, seed, shift) for each in sessions])
+        # Pairs of four in order: the first goes with the last.
+        shared = shared + products(crossed[:3], crossed[:2:-1], comparison).mean(axis=0) / SHIFTS
+    whole = every.whole()
+    return shared / products(whole, whole, comparison)
 
 
 def _signal(first: Floats, second: Floats, whole: Floats, method: str, comparison: str) -> Floats:
@@ -360,7 +383,7 @@ _TIE = 1e-12
 
 @dataclass(frozen=True)
 class Drift:
-    """Agreement of halves by time, and of random ones."""
+    """Agreement of parts by time, and of random ones."""
 
     by_time: float
     """Within sessions a reliability, between them a share of what any two sessions have in common."""
@@ -372,12 +395,12 @@ class Drift:
 
     @property
     def present(self) -> bool:
-        """True where halves by time agree less than chance explains."""
+        """True where parts by time agree less than chance explains."""
         return self.p <= self.level
 
     @property
     def reliable(self) -> bool:
-        """True where halves by time are as reliable as a score needs."""
+        """True where parts by time are as reliable as a score needs."""
         return self.by_time >= RELIABILITY_GATE
 
     @property
@@ -387,7 +410,7 @@ class Drift:
 
 
 def drift_within(animals: Sequence[SubjectRDM]) -> Drift | None:
-    """Compare the halves by time of every session's trials with random ones; None where no times are known."""
+    """Compare the parts by time of every session's trials with random ones; None where no times are known."""
     timed = [animal for animal in animals if animal.problem is None and np.isfinite(animal.by_time)]
     if not timed:
         return None
@@ -398,9 +421,27 @@ def drift_within(animals: Sequence[SubjectRDM]) -> Drift | None:
     observed = float(np.mean([animal.by_time for animal in timed]))
     p, smallest = _tail(null, observed), 1 / (len(null) + 1)
     shorter, longer = spearman_brown([observed, float(null.mean())])
+    share = float(shorter / longer) if longer > 0 else np.nan
+    # Halves by time agree less where tuning changes; quarters share less where neighbours in time have common noise.
+    if (apart := _apart(timed)) is not None and apart[0] < p:
+        (p, share), smallest = apart, 0.0
     reliability = float(np.mean([animal.reliability for animal in timed]))
-    by_time = reliability * float(shorter / longer) if longer > 0 else np.nan
-    return Drift(by_time, reliability, p, max(LEVEL, smallest), len(timed))
+    # The smaller p of two.
+    return Drift(reliability * share, reliability, min(1.0, 2 * p), 2 * max(LEVEL, smallest), len(timed))
+
+
+def _apart(animals: Sequence[SubjectRDM]) -> tuple[float, float] | None:
+    """Return the p of what quarters in time share, and its size beside random ones; None where no quarters are."""
+    from scipy.special import stdtr
+
+    observed, *null = finite_mean(np.stack([animal.apart for animal in animals]), axis=0)
+    chance = np.array(null)[np.isfinite(null)]
+    if not np.isfinite(observed) or len(chance) < 3 or not chance.std() > 0:
+        return None
+    # Means over animals, shifts and pairs of stimuli are nearly normal: Student's t of one value beside others.
+    t = (observed - chance.mean()) / (chance.std(ddof=1) * math.sqrt(1 + 1 / len(chance)))
+    share = max(0.0, float(observed)) / float(chance.mean()) if chance.mean() > 0 else math.nan
+    return float(stdtr(len(chance) - 1, t)), share
 
 
 def drift_between(animals: Sequence[SubjectRDM], *, seed: int = 0) -> Drift | None:

@@ -292,7 +292,7 @@ def animal_movie(subject: str, blocks: Sequence[Trials], n_stimuli: int, **optio
     how = {**_METHOD, **options}
     subjects = []
     for bin in range(shapes[0][1]):
-        parts = [replace(block, responses=np.asarray(block.responses)[:, bin]) for block in blocks]
+        parts = [replace(block, responses=np.asarray(block.responses)[:, bin], times=None) for block in blocks]
         subjects.append(subject_rdm(subject, parts, n_stimuli, **how))
     usable = np.array([item.problem is None for item in subjects])
     rdms = np.where(usable[:, None], np.stack([item.rdm for item in subjects]), np.nan)

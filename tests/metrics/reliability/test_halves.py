@@ -164,12 +164,11 @@ def test_silent_units_make_the_rdm_undefined_in_words():
     assert "constant across units" in found.problem
 
 
-@pytest.mark.parametrize("method", ["sqeuclidean", "poisson"])
-def test_other_distances_split_too(method):
+def test_other_distances_split_too():
     block = make_block(make_latent(8), noise=1.0)
     counts = Trials(np.abs(block.responses), block.labels, block.keys)
-    found = subject_rdm("a", [counts], 6, method=method, splits=20)
-    np.testing.assert_allclose(found.rdm, rdm(counts.responses, counts.labels, method=method), rtol=1e-11)
+    found = subject_rdm("a", [counts], 6, method="sqeuclidean", splits=20)
+    np.testing.assert_allclose(found.rdm, rdm(counts.responses, counts.labels, method="sqeuclidean"), rtol=1e-11)
     assert found.reliability > 0.5
 
 
@@ -189,8 +188,6 @@ def test_misuse_is_told_in_a_sentence():
         subject_rdm("a", [Trials(block.responses, np.array(STIMULI)[block.labels])], 6)
     with pytest.raises(DataError, match="infinite"):
         subject_rdm("a", [Trials(np.full((12, 2), np.inf), np.repeat(np.arange(6), 2))], 6)
-    with pytest.raises(DataError, match="never negative"):
-        subject_rdm("a", [block], 6, method="poisson")
     with pytest.raises(dataclasses.FrozenInstanceError):
         block.keys = None
 
