@@ -57,6 +57,8 @@ class MetricHooks:
     """Fewest stimuli with a value."""
     estimators: tuple[str, ...] = ("default",)
     """Names that ``estimator`` takes."""
+    value_error = 0.0
+    """Monte-Carlo error of a value without splits; NaN where it is not known."""
     of_rdms = False
     """True when layers and animals are compared by RDMs [P], which a record then shows."""
     of_unique_parts = False

@@ -124,7 +124,7 @@ def score_layers(
         about |= {"status": "unreliable", "reasons": (hopeless, *earlier) if status == "ok" else (*earlier, hopeless)}
     statistics = {
         "monte_carlo_error": {
-            "value": _splits_error(result.values, scored, metric.comparison) if metric.of_rdms else 0.0,
+            "value": _splits_error(result.values, scored, metric.comparison) if metric.of_rdms else metric.value_error,
             "p": result.test.monte_carlo_error,
             "chance": 0.0 if result.test.exact else float(null[1:].std(ddof=1) / math.sqrt(len(null))),
             "attainable": result.attainable_error,

@@ -401,7 +401,9 @@ class UnitMatching(PatternMetric):
         units, features = self.pairs(likeness)
         number = np.bincount(units, minlength=len(likeness))
         total = np.bincount(units, weights=likeness[units, features], minlength=len(likeness))
-        return np.divide(total, number, out=np.full(len(likeness), np.nan), where=number > 0)
+        values = np.full(animal.patterns.shape[1], np.nan)
+        values[_tuned(animal.patterns)] = np.divide(total, number, out=np.full(len(total), np.nan), where=number > 0)
+        return values
 
     def statistics(self, layer: Floats, animals: Sequence[SubjectRDM], seed: int) -> dict[str, Any]:
         """Return what each unit adds, and the means of each area, layer and cell type over the animals that have it."""
@@ -429,18 +431,22 @@ class UnitMatching(PatternMetric):
         return {"units": stated}
 
     def _tunings(self, model: Floats, animal: SubjectRDM) -> tuple[Floats, Floats]:
-        """Return the tunings of features [K, F] and of units [K, U], centred and of unit length; silent ones are 0."""
-        units = animal.patterns
-        features = model[:, self.chosen(model.shape[1], units.shape[1])]
-        return _unit_tunings(features), _unit_tunings(units)
+        """Return the tunings of features [K, F] and of units [K, U], centred and of unit length.
+
+        What never varies has no tuning that could be matched: silent units and features take no part.
+        """
+        features, units = (side[:, _tuned(side)] for side in (model, animal.patterns))
+        features = features[:, self.chosen(features.shape[1], units.shape[1])]
+        centred = (side - side.mean(axis=0) for side in (features, units))
+        first, second = (side / np.linalg.norm(side, axis=0) for side in centred)
+        return first, second
 
 
-def _unit_tunings(patterns: Floats) -> Floats:
-    centred = patterns - patterns.mean(axis=0)
-    length = np.linalg.norm(centred, axis=0)
-    # What rounding leaves of a constant response is no tuning.
+def _tuned(patterns: Floats) -> np.ndarray:
+    """Return which columns [U] of patterns [K, U] vary by more than rounding leaves of a constant."""
+    length = np.linalg.norm(patterns - patterns.mean(axis=0), axis=0)
     floor = 64 * np.finfo(float).eps * np.abs(patterns).max(axis=0, initial=0.0) * np.sqrt(len(patterns))
-    return np.divide(centred, length, out=np.zeros_like(centred), where=length > floor)
+    return np.asarray(length > floor)
 
 
 def _ordered(patterns: Floats) -> Floats:
@@ -468,6 +474,7 @@ class SoftMatching(UnitMatching):
 
     name = "soft-matching"
     title = "mean correlation over stimuli of units and features of equal masses, matched by optimal transport"
+    value_error = math.nan  # features of large layers are drawn
 
     def layer(self, features: ArrayLike) -> Floats:
         """Return a layer's features [K, F] in an order of their own."""
