@@ -267,7 +267,7 @@ def _compare(
         between = inputs.metric.score_animals(inputs.animals, **how) if baselines else None
     presentation = presentation_of(inputs.metric, inputs.animals, inputs.labels, control=baselines, seed=options.seed)
     spikes = "many trials share spikes with another one of their stimulus, which makes noise look reliable"
-    recorded = brain.label_doubt, spikes if brain.dependent else ""
+    recorded = brain.label_doubt, spikes if brain.dependent else "", of_no_neurons(inputs.metric, inputs.animals)
     wrong = *presentation.doubts, *filter(None, recorded)
     scores = [doubted(score, *wrong) for score in scores]
     stated = scores[0].provenance
@@ -338,6 +338,7 @@ def metric_of(options: ScoreOptions) -> Metric:
 
 
 DECIDES = 0.5  # share from which a unit or an animal decides alone
+EXACT = 0.2  # share of the tuning from which units without noise are a doubt: .25 takes a score of .66 to .59
 _CHANCE_LEVEL = 0.05
 
 
@@ -359,6 +360,19 @@ def unit_shares(animal: Any, *, by_noise: bool = False) -> NDArray[np.float64]:
     noise = animal.noise.mean(axis=0)
     tuned = np.maximum(animal.patterns.var(axis=0, ddof=1) - noise, 0.0)
     return np.divide(tuned, noise, out=np.zeros_like(tuned), where=noise > 0) if by_noise else tuned
+
+
+def of_no_neurons(metric: Any, animals: Sequence[Any]) -> str:
+    """Return the doubt that units without noise beside noisy ones, as channels of stimuli, count much; or nothing."""
+    marked = []
+    for animal in animals:
+        exact, shares = ~(animal.noise > 0).any(axis=0), unit_shares(animal) if animal.problem is None else np.zeros(0)
+        if shares.any() and not exact.all() and shares[exact].sum() > EXACT * shares.sum():
+            marked.append(f"{animal.subject}: {int((shares[exact] > 0).sum())} of {len(exact)}")
+    if not marked or getattr(metric, "noise", "none") != "none":
+        return ""
+    share = f"{EXACT:.0%} of the tuning in {len(marked)} of {len(animals)} animals ({marked[0]})"
+    return f"units that never vary between trials, as neurons do, have more than {share}: leave them out"
 
 
 def influence_of(score: Score, metric: Any, animals: Sequence[Any]) -> tuple[dict[str, Any], tuple[str, ...]]:

@@ -21,7 +21,14 @@ from brainbench.datasets import write_recordings
 from brainbench.datasets.trials.session_trials import pooled
 from brainbench.metrics import get_metric
 from brainbench.models.features import write_features
-from brainbench.scoring.scores import effective_number, held_parts, influence_of, score_record, unit_shares
+from brainbench.scoring.scores import (
+    effective_number,
+    held_parts,
+    influence_of,
+    of_no_neurons,
+    score_record,
+    unit_shares,
+)
 from leaderboards.audit import differences
 
 LABELS = ("a", "b", "c", "d", "e", "f")
@@ -402,6 +409,22 @@ def test_units_that_are_alike_all_count_and_a_loud_one_is_named():
     assert "one of 30 units has 9" in remarks[0]
     # Divided by its noise, a loud unit is one of many.
     assert influence_of(_score(hidden, animals), get_metric("rsa-crossnobis"), animals)[1] == ()
+
+
+def test_units_that_never_vary_between_trials_are_no_neurons_where_they_decide():
+    hidden, animals = _make_animals()
+    metric = get_metric("rsa")
+    rng, marked = np.random.default_rng(1), []
+    for animal in animals:
+        # Three channels of the apparatus, each a number of the stimulus: none has half of the tuning.
+        exact = 20 * rng.normal(size=(10, 3))
+        patterns = np.concatenate([animal.patterns, exact], axis=1)
+        marked.append(replace(animal, patterns=patterns, noise=np.pad(animal.noise, ((0, 0), (0, 3))), units=33))
+    assert influence_of(_score(hidden, marked), metric, marked)[1] == ()
+    assert of_no_neurons(metric, marked).endswith("3 of 3 animals (m0: 3 of 33): leave them out")
+    assert of_no_neurons(metric, animals) == of_no_neurons(get_metric("rsa-crossnobis"), marked) == ""
+    # Of a program all units are exact.
+    assert of_no_neurons(metric, [replace(each, noise=0 * each.noise) for each in marked]) == ""
 
 
 def test_the_share_of_a_unit_is_what_it_adds_to_squared_distances_without_noise():

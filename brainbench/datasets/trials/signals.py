@@ -76,8 +76,8 @@ class Samples:
         """Take a signal of a session whose trials stand in a table."""
         name, shape = f"{series.name} of {session.source}", tuple(series.data.shape)
         cells = replace(series.cells, where=name)
-        if len(cells) != (shape[-1] if len(shape) > 1 else 1):
-            raise DataError(f"{name} has the shape {shape}, and {len(cells)} units are named.")
+        if len(cells) != (shape[-1] if len(shape) > 1 else 1) or len(shape) > 2 + bool(series.table):
+            raise DataError(f"{name} has the shape {shape}, not [frame, unit], and {len(cells)} units are named.")
         if not series.table:
             samples = cls(cells, series, series.times(), name, band=window.band)
             if samples.band is not None and not 2 * samples.band[1] * samples.step < 1:

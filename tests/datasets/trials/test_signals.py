@@ -44,6 +44,12 @@ def test_responses_are_means_over_the_window_and_may_be_negative(tmp_path):
     np.testing.assert_array_equal(again["counts"], opened["counts"])
 
 
+def test_signals_of_other_than_frames_and_units_are_refused(tmp_path):
+    path = imaged(tmp_path / "a.nwb", np.zeros((70, 2, 3)))
+    with pytest.raises(DataError, match=r"has the shape \(70, 2, 3\), not \[frame, unit\]"):
+        open_recordings(path, conditions="trials:texture")
+
+
 def test_bins_timestamps_and_chosen_cells(tmp_path):
     data = np.random.default_rng(0).normal(size=(70, 3))
     path = imaged(tmp_path / "a.nwb", data, stamps=0.001 + np.arange(70) / 10)
