@@ -118,13 +118,10 @@ def _correction(metric: MetricHooks, subject: SubjectRDM, estimator: str) -> Cor
 
 
 def mean_reliability(animals: Animals) -> tuple[float, Interval | None]:
-    """Return the mean reliability over the scored animals with its interval (one animal: its spread)."""
+    """Return the mean reliability over the scored animals with its interval; of one animal it has none."""
     values = np.array([animals.corrections[i].reliability for i in animals.scored])
     if not values.size:
         return math.nan, None
-    # One animal has no interval over animals; the spread over its splits stands in and says so.
-    if len(values) == 1:
-        return float(values[0]), animals.subjects[animals.scored[0]].spread
     return float(values.mean()), t_interval(values, over="animals")
 
 

@@ -239,7 +239,8 @@ def compare(a: ArrayLike, b: ArrayLike, *, method: str = "pearson") -> Floats:
         raise UsageError(f"RDMs of shapes {left.shape} and {right.shape} do not broadcast.") from error
     if not (np.isfinite(left).all() and np.isfinite(right).all()):
         return _compare_present(np.broadcast_to(left, shape), np.broadcast_to(right, shape), method)
-    return _compare_complete(left, right, method)
+    # The broadcast product of all comparisons and all pairs is never formed.
+    return np.einsum("...p,...p->...", features(left, method), features(right, method))
 
 
 def compare_all(a: Floats, b: Floats, *, method: str = "pearson") -> Floats:
@@ -441,12 +442,6 @@ _METHODS: dict[str, tuple[Transform, Transform]] = {
 COMPARISONS = tuple(_METHODS)  # names that `method` of compare takes
 
 
-def _compare_complete(left: Floats, right: Floats, method: str) -> Floats:
-    """Compare RDMs [..., P] that broadcast and lack no pair."""
-    # The broadcast product of all comparisons and all pairs is never formed.
-    return np.einsum("...p,...p->...", features(left, method), features(right, method))
-
-
 def _compare_present(left: Floats, right: Floats, method: str) -> Floats:
     """Compare over the pairs present in both RDMs, together for all comparisons that lack the same pairs."""
     shape = left.shape[:-1]
@@ -462,7 +457,7 @@ def _compare_present(left: Floats, right: Floats, method: str) -> Floats:
         if method.startswith("whitened") and not keep.all():
             result[rows] = _whitened_present(a, b, keep, centre=method == "whitened-pearson")
         else:
-            result[rows] = _compare_complete(a, b, method)
+            result[rows] = np.einsum("...p,...p->...", features(a, method), features(b, method))
     return result.reshape(shape)
 
 

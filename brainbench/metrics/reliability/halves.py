@@ -74,21 +74,17 @@ class SplitRDMs:
         ``parts`` are the numbers [N, R] of the parts in each session; their pairs come in order. Noise that no two
         parts share is on average in none.
         """
-        pairs, total, number = [*combinations(range(4), 2)], 0.0, 0.0
+        pairs, total = [*combinations(range(4), 2)], 0.0
         for session, numbers in zip(self._sessions, parts, strict=True):
             # The factor has the products of the responses in fewer columns.
             part = replace(session, responses=session.factor) if session.complete else session
+            members = np.concatenate([(numbers == index) * 1.0 for index in range(4)])
             for units in part.slices():
-                members = np.concatenate([(numbers == index) * 1.0 for index in range(4)])
                 means = np.split(mean_patterns(part, members, self._count, variances=False, units=units)[0], 4)
                 sides = np.stack([means[a] for a, _ in pairs]), np.stack([means[b] for _, b in pairs])
-                both = np.array(float(means[0].shape[-1]))
-                if not session.complete:
-                    present = np.isfinite(sides[0] + sides[1]) * 1.0
-                    both = upper(present @ present.swapaxes(-1, -2))
                 distances = dissimilarity.product_distances(*sides, missing=not session.complete)
-                total, number = total + np.where(both > 0, distances * both, 0.0), number + both
-        return np.divide(total, number, out=np.full(np.shape(total), np.nan), where=number > 0)
+                total = total + distances * means[0].shape[-1]
+        return np.asarray(total)
 
     def _summed(self, members: list[Floats]) -> list[_Sums]:
         return [_Sums(*each, self._count) for each in zip(self._sessions, members, strict=True)]

@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 
 from brainbench.core.contracts import Trials, natural_key
 from brainbench.core.errors import UsageError, check_name, check_number
-from brainbench.core.records import Interval
 from brainbench.metrics.arrays import Floats, Ints, finite_mean
 from brainbench.metrics.rdms.comparison import (
     LINEAR,
@@ -74,9 +73,6 @@ class SubjectRDM:
     reliability: float = math.nan
     """The mean of ``signal``, at most 1; without it the Spearman-Brown reliability of the mean of ``split_half_r``
     (averaged before, not after, the formula)."""
-    spread: Interval | None = None
-    """Percentiles of single splits' values: how much one split would have misled, not a confidence interval of the
-    reliability."""
     seed: int = 0
     problem: str | None = None
     """Reason for having no usable RDM, in words; None otherwise."""
@@ -202,16 +198,11 @@ def subject_rdm(
     halves, r, signal = _split_halves(sessions, n_stimuli, distance, comparison, splits, seed, rdm)
     signal |= _in_time(sessions, n_stimuli, distance, comparison, seed)
     animal = replace(empty, rdm=rdm, split_half_r=r, halves=halves, patterns=patterns, noise=variances, **signal)
-    finite = r[np.isfinite(r)]
-    if not np.isfinite(rdm).all() or not finite.size:
+    if not np.isfinite(rdm).all() or not np.isfinite(r).any():
         flat = np.isnan(rdm).any()
         reason = "the mean responses to a stimulus are constant across units" if flat else "all pairs are equal"
         return replace(animal, problem=f"its RDM is undefined: {reason}")
-    # The formula has a pole at r = −1, across which percentiles mean nothing.
-    single = animal.signal if animal.signal.size else spearman_brown(finite)
-    low, high = np.percentile(single, [2.5, 97.5]) if (finite > -1).all() else (math.nan, math.nan)
-    spread = Interval(float(low), float(high), 0.95, "percentiles over random splits; not a confidence interval")
-    return replace(animal, reliability=animal.reliability_by(comparison), spread=spread)
+    return replace(animal, reliability=animal.reliability_by(comparison))
 
 
 def _mean_responses(sessions: list[SortedTrials], count: int) -> tuple[Floats, Floats]:
