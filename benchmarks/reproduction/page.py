@@ -23,6 +23,7 @@ from benchmarks.reproduction.contrasts import Effect, Matched, Observed, contras
 from benchmarks.reproduction.measures import Measured, accuracies, fits, observed, published_accuracy
 from benchmarks.reproduction.touch import RULE, part_two, stimuli_table, write_pages
 from brainbench.core.files import write_text
+from brainbench.core.records import ESTIMATOR_VERSION
 from brainbench.core.statistics import is_finite, wilson_interval
 from leaderboards.figures.charts import board_figures
 from leaderboards.figures.svg import Drawing, standalone
@@ -58,6 +59,7 @@ def write_page(campaign: Campaign, out: Path) -> tuple[list[Path], list[Judgemen
     fit = [judge_fit(campaign, place, error) for place in places]
     boards = {board_name(board): board for board in campaign.boards}
     lacks = [(name, board.lacks) for name, board in boards.items() if board.lacks]
+    versions = {board.estimator.partition("version ")[2] or str(ESTIMATOR_VERSION) for board in campaign.boards}
     figures, images = _figures(campaign, out)
     ranked = ["ranking by", "τ of two seeds (networks)", "mean τ", "goal"]
     columns = ["claim", "published", "published effect", "ours", "comparisons", "verdict"]
@@ -65,6 +67,7 @@ def write_page(campaign: Campaign, out: Path) -> tuple[list[Path], list[Judgemen
     values = {
         "synthetic": _SYNTHETIC if any(board.synthetic for board in campaign.boards) else "",
         "trained": _trained(campaign),
+        "version": ", ".join(sorted(versions)),
         "counts": f"{_counts('Accuracy and training', accuracy)}\n{_counts('Neural fit', fit[0])}",
         "accuracy": _table(columns, map(_accuracy_row, accuracy), columns[2:5]),
         "too_small": "".join(f"On {name} the rule leaves all undecided: it needs {lack}.\n" for name, lack in lacks),

@@ -59,9 +59,6 @@ def export(
             the layout names, else to ``trials``.
         format: ``brainbench`` (our layout, any number of sessions in a file; the one of ``*.h5``), ``nwb`` (the one of
             folders), or ``temporaldata``, whose files torch_brain reads and which holds signals too.
-
-    Returns:
-        The files that were written.
     """
     target = Path(target)
     ending = target.suffix.lower()

@@ -26,7 +26,7 @@ from brainbench.core.provenance import Provenance
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord, Score
 from brainbench.scoring.options import ScoreOptions
 from brainbench.scoring.own_stimuli import joined
-from brainbench.scoring.presentation import presentation_of
+from brainbench.scoring.presentation import CHANCE_LEVEL, presentation_of
 
 if TYPE_CHECKING:
     from brainbench.metrics import Metric
@@ -84,9 +84,6 @@ def score(
         baselines, progress: see :func:`score_record`.
         **changes: single fields of :class:`~brainbench.scoring.options.ScoreOptions`, such as
             ``recordings="data/*.nwb"`` or ``metric="cka"``.
-
-    Returns:
-        The score with its statistics.
     """
     return score_record(model, options, baselines=baselines, progress=progress, **changes).score
 
@@ -107,9 +104,6 @@ def score_record(
         baselines: also score the raw input, random features, times of presentation and animal against animal.
         command: the command line that makes this record, kept in its provenance.
         progress: called with (done, total, what).
-
-    Returns:
-        The result record; its scores share one brain side.
     """
     from brainbench.scoring.model_responses import resolve_model
     from brainbench.scoring.neural_responses import open_neural_responses
@@ -339,7 +333,6 @@ def metric_of(options: ScoreOptions) -> Metric:
 
 DECIDES = 0.5  # share from which a unit or an animal decides alone
 EXACT = 0.2  # share of the tuning from which units without noise are a doubt: .25 takes a score of .66 to .59
-_CHANCE_LEVEL = 0.05
 
 
 def effective_number(shares: ArrayLike) -> float:
@@ -366,8 +359,8 @@ def of_no_neurons(metric: Any, animals: Sequence[Any]) -> str:
     """Return the doubt that units without noise beside noisy ones, as channels of stimuli, count much; or nothing."""
     marked = []
     for animal in animals:
-        exact, shares = ~(animal.noise > 0).any(axis=0), unit_shares(animal) if animal.problem is None else np.zeros(0)
-        if shares.any() and not exact.all() and shares[exact].sum() > EXACT * shares.sum():
+        exact = ~(animal.noise > 0).any(axis=0)
+        if not exact.all() and (shares := unit_shares(animal))[exact].sum() > EXACT * shares.sum():
             marked.append(f"{animal.subject}: {int((shares[exact] > 0).sum())} of {len(exact)}")
     if not marked or getattr(metric, "noise", "none") != "none":
         return ""
@@ -396,7 +389,7 @@ def influence_of(score: Score, metric: Any, animals: Sequence[Any]) -> tuple[dic
     if np.isfinite(heights).all() and heights.any():
         stated |= {"animals": effective_number(heights), "of_animals": len(scored)}
         first = int(np.argmax(heights))
-        if len(scored) > 2 and heights[first] > DECIDES * heights.sum() and score.p <= _CHANCE_LEVEL:
+        if len(scored) > 2 and heights[first] > DECIDES * heights.sum() and score.p <= CHANCE_LEVEL:
             share = heights[first] / heights.sum()
             remarks.append(f"one animal decides: {scored[first].subject} has {share:.0%} of the score")
     return {"effective": stated} if stated else {}, tuple(remarks)

@@ -201,7 +201,7 @@ SYNTHETIC = RecordingLayout(
 
 
 def fetch(name: str, folder: str | os.PathLike[str] = ".", *, assets: str | None = None) -> Path:
-    """Download a data set of the DANDI archive (https://dandiarchive.org).
+    """Download a data set of the DANDI archive (https://dandiarchive.org); return its folder, ``folder/NUMBER``.
 
     What is there already is kept if unchanged, so an interrupted download goes on.
 
@@ -209,9 +209,6 @@ def fetch(name: str, folder: str | os.PathLike[str] = ".", *, assets: str | None
         name: a layout's name, or the six digits of a dandiset.
         folder: where to put it.
         assets: glob of the files wanted, such as ``"sub-231CR/*"``; by default those that the layout can use, else all.
-
-    Returns:
-        The folder of the data set, ``folder/NUMBER``.
     """
     number, pattern = _dandiset(name)
     client = shutil.which("dandi")

@@ -261,7 +261,6 @@ def _in_time(sessions: list[SortedTrials], count: int, method: str, comparison: 
     if all(session.times is not None for session in sessions):
         first, second = SplitRDMs(sessions, count, method).halves([split_members(each, None, 0) for each in sessions])
         stated["by_time"] = float(compare(first, second, method=comparison)[0])
-        # Few at once, so that memory does not grow with the stimuli; of many pairs few are enough.
         number = max(_QUARTERS // 4, _QUARTERS * 40 // max(count, 40))
         step = max(1, _CHUNK_BYTES // (48 * count * max(count, *(min(part.responses.shape) for part in sessions))))
         index = [None, *(np.arange(start, min(start + step, number)) for start in range(0, number, step))]

@@ -91,8 +91,10 @@ def power(
         f">animals for {target:.0%}": lambda row: enough_text(row, "animals"),
     }
     note = "True score 0 is the rate of false alarms. Animals needed are for the given stimuli, and the reverse."
+    note += "" if pilot is None else " The pilot gives dimensions alone: state its own --reliability and --consistency."
     data = {
         "dimensions": {"number": number, "origin": origin},
+        "note": note,
         "results": [{**to_plain(result), "needed": enough, "target": target} for result, enough in rows],
     }
     text = f"{title}\n\n{table_of('', rows, columns)}\n\n{note}"

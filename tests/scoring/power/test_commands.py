@@ -40,7 +40,10 @@ def test_dimensions_are_estimated_given_or_assumed(run, tmp_path):
     assert found["dimensions"]["number"] in (1, 2, 3)
     assert found["results"][0]["design"]["dimensions"] == found["dimensions"]["number"]
     assert json.loads(run(*common, "--dimensions", "7").out)["dimensions"] == {"number": 7, "origin": "given"}
-    assert json.loads(run(*common).out)["dimensions"]["number"] == 10
+    assert "The pilot gives dimensions alone" in found["note"]
+    assumed = json.loads(run(*common).out)
+    assert assumed["dimensions"]["number"] == 10
+    assert "pilot" not in assumed["note"]
 
 
 def test_dimensions_that_are_no_number_are_refused(run):
