@@ -101,11 +101,14 @@ def parity_rows() -> list[list[str]]:
         "sqeuclidean": "euclidean",
         "mahalanobis": "mahalanobis",
         "crossnobis": "crossnobis",
+        "poisson": "poisson",
     }
     comparisons = {
         "pearson": "corr",
         "spearman": "spearman",
         "rho-a": "rho-a",
+        "tau-a": "tau-a",
+        "tau-b": "kendall",
         "cosine": "cosine",
         "whitened-cosine": "cosine_cov",
         "whitened-pearson": "corr_cov",

@@ -64,6 +64,8 @@ THEIRS = {
     "pearson": "corr",
     "spearman": "spearman",
     "rho-a": "rho-a",
+    "tau-a": "tau-a",
+    "tau-b": "tau-b",
     "cosine": "cosine",
     "whitened-cosine": "cosine_cov",
     "whitened-pearson": "corr_cov",

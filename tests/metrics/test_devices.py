@@ -38,7 +38,7 @@ def test_rdms_of_trials_are_the_same(method, dtype, device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("method", ["correlation", "sqeuclidean"])
+@pytest.mark.parametrize("method", ["correlation", "sqeuclidean", "poisson"])
 def test_rdms_of_wide_patterns_are_the_same_in_slices(method, device, monkeypatch):
     monkeypatch.setattr("brainbench.metrics.rdms.dissimilarity._SLICE_ELEMENTS", 64)
     patterns = 1e4 + np.random.default_rng(1).gamma(2.0, size=(6, 301))

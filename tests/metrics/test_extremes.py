@@ -121,7 +121,7 @@ def test_two_thousand_stimuli_are_compared_and_tested():
     shared = rng.normal(size=(2000, 30))
     model, brain = rdm(shared), np.stack([rdm(shared + rng.normal(size=shared.shape)) for _ in range(2)])
     assert model.shape == (1_999_000,)
-    for method in ("pearson", "spearman", "cosine", "whitened-pearson"):
+    for method in ("pearson", "spearman", "tau-a", "cosine", "whitened-pearson"):
         assert (compare(model, brain, method=method) > 0.1).all()
 
 

@@ -245,7 +245,7 @@ def test_three_stimuli_have_a_value_but_no_p_and_two_have_nothing():
     assert two.reasons[0].startswith("2 stimuli are too few")
 
 
-@pytest.mark.parametrize("method", ["spearman", "cosine", "rho-a", "whitened-pearson"])
+@pytest.mark.parametrize("method", ["spearman", "cosine", "tau-a", "whitened-pearson"])
 def test_other_comparisons_use_their_own_split_halves(method):
     latent = make_latent(13)
     animals = make_animals(latent, 3)

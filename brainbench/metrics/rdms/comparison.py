@@ -202,19 +202,21 @@ _FEW_STIMULI, _BLOCK_ELEMENTS = 64, 1 << 24
 """Up to so many stimuli all orders of a chunk are compared at once; numbers of layers' matrices that are held."""
 _ORDERS, _ROWS = 64, 4  # orders, and rows of matrices, that are moved at once
 
+_SIGN_LIMIT = 128  # above this many pairs Kendall's tau sorts (P log P) instead of comparing all pairs of pairs (P²)
+
 
 def compare(a: ArrayLike, b: ArrayLike, *, method: str = "pearson") -> Floats:
     """Compare RDMs ``a`` [..., P] with ``b`` [..., P]; leading axes broadcast as in numpy.
 
     Pairs that are NaN in either RDM are left out of that comparison. A comparison without a value (an RDM constant over
-    the pairs that are left, fewer than 2 pairs) is NaN, except that ``rho-a`` of a constant RDM is 0 by definition and
-    the cosines need only a non-zero RDM. Nothing is clipped: rounding may give 1 + 2e-16.
+    the pairs that are left, fewer than 2 pairs) is NaN, except that ``rho-a`` and ``tau-a`` of a constant RDM are 0 by
+    definition and the cosines need only a non-zero RDM. Nothing is clipped: rounding may give 1 + 2e-16.
 
     Args:
         a: RDMs, upper triangles.
         b: RDMs of the same stimuli in the same order.
         method: ``pearson``; ``spearman``; ``rho-a`` (Spearman, expected over random breaking of ties);
-            ``cosine``; ``whitened-cosine``, ``whitened-pearson``
+            ``tau-a``, ``tau-b`` (Kendall); ``cosine``; ``whitened-cosine``, ``whitened-pearson``
             (Diedrichsen 2021: weighted by the covariance of distances that share a stimulus).
 
     Returns:
@@ -239,13 +241,13 @@ def compare(a: ArrayLike, b: ArrayLike, *, method: str = "pearson") -> Floats:
         raise UsageError(f"RDMs of shapes {left.shape} and {right.shape} do not broadcast.") from error
     if not (np.isfinite(left).all() and np.isfinite(right).all()):
         return _compare_present(np.broadcast_to(left, shape), np.broadcast_to(right, shape), method)
-    # The broadcast product of all comparisons and all pairs is never formed.
-    return np.einsum("...p,...p->...", features(left, method), features(right, method))
+    return _compare_complete(left, right, method)
 
 
 def compare_all(a: Floats, b: Floats, *, method: str = "pearson") -> Floats:
     """Compare every ``a`` [..., N, P] with every ``b`` [..., A, P] by one matrix product each: [..., N, A]."""
-    if not (np.isfinite(a).all() and np.isfinite(b).all()):
+    sorts = a.shape[-1] > _SIGN_LIMIT and method in _BY_SORTING
+    if sorts or not (np.isfinite(a).all() and np.isfinite(b).all()):
         return compare(a[..., :, None, :], b[..., None, :, :], method=method)
     return features(a, method) @ features(b, method).swapaxes(-1, -2)
 
@@ -255,12 +257,13 @@ def permuted_comparisons(
 ) -> Iterator[Floats]:
     """Yield comparisons [N, L, A] of layers [L, P], with their stimuli in each order of a chunk [N, K], with animals.
 
-    Ranks, means and lengths of an RDM do not feel the order of its stimuli, so what comparisons multiply is made
+    Ranks, means and lengths of an RDM do not feel the order of its stimuli, so what most comparisons multiply is made
     once and every order only moves it: one gather and one matrix product, on the processor or on a torch device.
-    RDMs that lack pairs are compared order by order. Animals are RDMs [A, P]; without a device numpy computes, many
-    stimuli order by order and in blocks of layers.
+    Kendall's tau, whose vectors are of pairs of pairs, is compared order by order by numpy. Animals are RDMs [A, P];
+    without a device numpy computes, many stimuli order by order and in blocks of layers.
     """
-    if not (np.isfinite(layers).all() and np.isfinite(brain).all()):
+    complete = bool(np.isfinite(layers).all() and np.isfinite(brain).all())
+    if not complete or method not in (*_OF_PAIRS, *_OF_MATRICES):
         for orders in chunks:
             permuted = layers[:, permuted_pairs(orders)].swapaxes(0, 1).reshape(-1, layers.shape[-1])
             yield compare_all(permuted, brain, method=method).reshape(len(orders), len(layers), len(brain))
@@ -377,7 +380,7 @@ def pooling(method: str) -> Transform:
     """Return the transform [..., P] → [..., P] of RDMs before they are averaged to predict one another.
 
     Nili 2014: unit vectors for the cosines, standardised ones for the correlations (the whitened ones
-    too, as in rsatoolbox), ranks for the rank correlations.
+    too, as in rsatoolbox), ranks for the rank correlations (approximate for Kendall's tau).
     """
     return _METHODS[method][1]
 
@@ -410,6 +413,19 @@ def _rho_a(rdms: Floats) -> Floats:
     return _centred(_ranks(rdms)) * np.sqrt(12.0 / (count**3 - count))
 
 
+def _signs(rdms: Floats) -> Floats:
+    if rdms.shape[-1] < 2:
+        return np.full((*rdms.shape[:-1], 1), np.nan)
+    rows, cols = np.triu_indices(rdms.shape[-1], k=1)
+    return np.sign(rdms[..., rows] - rdms[..., cols])
+
+
+def _tau_a(rdms: Floats) -> Floats:
+    count = rdms.shape[-1]
+    # Kendall's τ-a: mean product of the signs of all differences between pairs; tied ones are zero.
+    return _signs(rdms) / np.sqrt(count * (count - 1) / 2)
+
+
 def _second_moment(rdms: Floats) -> Floats:
     """Return the doubly centred −½D, flattened: its inner product is dᵀV⁻¹d up to a constant."""
     # G = −½ H D H with the centring matrix H; so the covariance V [P, P] of distances is never formed.
@@ -433,6 +449,9 @@ _METHODS: dict[str, tuple[Transform, Transform]] = {
     "pearson": (_pearson, _pearson),
     "spearman": (lambda rdms: _pearson(_ranks(rdms)), _ranks),
     "rho-a": (_rho_a, _ranks),
+    "tau-a": (_tau_a, _ranks),
+    # τ-b divides by the root of each side's untied differences, which is the length of its vector of signs.
+    "tau-b": (lambda rdms: _unit(_signs(rdms)), _ranks),
     "cosine": (_unit, _unit),
     "whitened-cosine": (lambda rdms: _unit(_second_moment(rdms)), _unit),
     "whitened-pearson": (lambda rdms: _unit(_second_moment(_centred(rdms)), rdms), _pearson),
@@ -440,6 +459,16 @@ _METHODS: dict[str, tuple[Transform, Transform]] = {
 """Comparison → what makes its vectors, and what RDMs pass through before they are averaged."""
 
 COMPARISONS = tuple(_METHODS)  # names that `method` of compare takes
+
+
+def _compare_complete(left: Floats, right: Floats, method: str) -> Floats:
+    """Compare RDMs [..., P] that broadcast and lack no pair."""
+    if method in _BY_SORTING and left.shape[-1] > _SIGN_LIMIT:
+        shape = np.broadcast_shapes(left.shape, right.shape)
+        a, b = (np.broadcast_to(rdms, shape).reshape(-1, shape[-1]) for rdms in (left, right))
+        return np.array(list(map(_BY_SORTING[method], a, b))).reshape(shape[:-1])
+    # The broadcast product of all comparisons and all pairs is never formed.
+    return np.einsum("...p,...p->...", features(left, method), features(right, method))
 
 
 def _compare_present(left: Floats, right: Floats, method: str) -> Floats:
@@ -457,7 +486,7 @@ def _compare_present(left: Floats, right: Floats, method: str) -> Floats:
         if method.startswith("whitened") and not keep.all():
             result[rows] = _whitened_present(a, b, keep, centre=method == "whitened-pearson")
         else:
-            result[rows] = np.einsum("...p,...p->...", features(a, method), features(b, method))
+            result[rows] = _compare_complete(a, b, method)
     return result.reshape(shape)
 
 
@@ -478,3 +507,19 @@ def _whitened_present(a: Floats, b: Floats, keep: np.ndarray, *, centre: bool) -
     floor = (_CONSTANT**2 * (a * a).sum(axis=1)) * (_CONSTANT**2 * (b * b).sum(axis=1))
     product = np.einsum("np,np->n", x, solved_y)
     return np.divide(product, np.sqrt(size), out=np.full(len(x), np.nan), where=size > floor)
+
+
+def _sorted_tau_b(x: Floats, y: Floats) -> float:
+    from scipy.stats import kendalltau
+
+    return float(np.asarray(kendalltau(x, y))[0])
+
+
+def _sorted_tau_a(x: Floats, y: Floats) -> float:
+    # scipy's τ-b in P log P, times what it divides by: the root of each side's share of untied differences.
+    pairs = len(x) * (len(x) - 1) // 2
+    untied = [pairs - sum(n * (n - 1) // 2 for n in np.unique(v, return_counts=True)[1].tolist()) for v in (x, y)]
+    return _sorted_tau_b(x, y) * float(np.sqrt(untied[0] / pairs) * np.sqrt(untied[1] / pairs)) if all(untied) else 0.0
+
+
+_BY_SORTING: dict[str, Callable[[Floats, Floats], float]] = {"tau-a": _sorted_tau_a, "tau-b": _sorted_tau_b}

@@ -274,7 +274,7 @@ def product_distances(left: Array, right: Array, *, missing: bool = False, devic
     """Return Σ_u (a_i − a_j)(b_i − b_j) / U for patterns a, b [..., K, U] as [..., P].
 
     With a = b this is the squared Euclidean distance per unit; with b = a·precision Mahalanobis;
-    with a, b from two folds crossnobis.
+    with a, b from two folds crossnobis; with b = log a the symmetrised Poisson divergence.
     """
     xp = library(left)
     with np.errstate(invalid="ignore", over="ignore"):
@@ -341,6 +341,9 @@ def _correlation_of_present(patterns: Array) -> Array:
     scatter = xp.where((both >= 2) & (scatter > floor), scatter, np.nan)
     return upper(1.0 - product / xp.sqrt(scatter * scatter.swapaxes(-1, -2)))
 
+
+POISSON_PRIOR_MEAN = 1.0
+POISSON_PRIOR_WEIGHT = 0.1  # gamma prior that keeps the logarithm of a silent unit finite (rsatoolbox's defaults)
 
 _ASYMMETRY = 1e-6  # largest difference across the diagonal of a noise precision, as a share of its largest number
 
@@ -411,7 +414,8 @@ def rdm(
         labels: Stimulus of each trial, or None.
         method: ``correlation`` 1 − Pearson r; ``sqeuclidean``; ``mahalanobis`` (with ``precision``;
             squared Euclidean without); ``crossnobis`` cross-validated Mahalanobis distance, mean over
-            pairs of folds (Walther 2016; unbiased, can be negative).
+            pairs of folds (Walther 2016; unbiased, can be negative); ``poisson`` symmetrised
+            Kullback-Leibler divergence of Poisson rates (Schütt 2023).
         folds: Cross-validation fold of each trial [R]; needed by ``crossnobis`` only. Every fold weighs
             the same; fold pairs in which a stimulus is missing are left out of its pairs.
         precision: Inverse noise covariance [U, U] between units, symmetric, or the name of an estimator of
@@ -510,6 +514,23 @@ def _crossnobis_of_present(given: _Responses, means: Array) -> Array:
     return xp.where(number > 0, total / xp.where(number > 0, number, 1.0), np.nan)
 
 
+def _poisson(given: _Responses) -> Array:
+    patterns = place(given.patterns(), given.device)
+    values = patterns[~library(patterns).isnan(patterns)]
+    low = float(values.min()) if len(values) else 0.0
+    if low < 0:
+        raise DataError(f"method='poisson' needs rates or counts, which are never negative; the smallest is {low:g}.")
+    # Σ (λ_i − λ_j)(log λ_i − log λ_j) / U, the divergence in both directions (Schütt 2023).
+    rates = poisson_rates(patterns)
+    return product_distances(rates, library(rates).log(rates), missing=given.codes is not None)
+
+
+def poisson_rates(rates: Array) -> Array:
+    """Return rates [K, U] under the gamma prior, in the unit given, which are never zero."""
+    # Posterior mean after one observation under a gamma prior with this mean and weight.
+    return (rates + POISSON_PRIOR_MEAN * POISSON_PRIOR_WEIGHT) / (1 + POISSON_PRIOR_WEIGHT)
+
+
 _METHODS: dict[str, Callable[[_Responses], Array]] = {
     "correlation": lambda given: correlation_distances(
         given.patterns(), missing=given.codes is not None, device=given.device
@@ -517,6 +538,7 @@ _METHODS: dict[str, Callable[[_Responses], Array]] = {
     "sqeuclidean": _sqeuclidean,
     "mahalanobis": _mahalanobis,
     "crossnobis": _crossnobis,
+    "poisson": _poisson,
 }
 
 RDM_METHODS = tuple(_METHODS)  # names that `method` of rdm takes

@@ -145,6 +145,9 @@ class SplitRDMs:
             with np.errstate(invalid="ignore", divide="ignore"):
                 noise = upper((summed + np.swapaxes(summed, -1, -2)) / shared)
                 return dissimilarity.product_distances(seen, seen, missing=True) - noise, both
+        if self._method == "poisson":
+            rates = dissimilarity.poisson_rates(patterns)
+            return dissimilarity.product_distances(rates, np.log(rates), missing=True), both
         return dissimilarity.product_distances(patterns, patterns, missing=True), both
 
 

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import Trials, natural_key
-from brainbench.core.errors import UsageError, check_name, check_number
+from brainbench.core.errors import DataError, UsageError, check_name, check_number
 from brainbench.metrics.arrays import Floats, Ints, finite_mean
 from brainbench.metrics.rdms.comparison import (
     LINEAR,
@@ -190,10 +190,13 @@ def subject_rdm(
     )
     if problem is not None:
         return empty
+    if method == "poisson" and any((session.responses < 0).any() for session in sessions):
+        raise DataError("method='poisson' needs rates or counts, which are never negative; some responses are.")
     # Trials without noise covariance left make squared distances Mahalanobis distances.
     distance = "sqeuclidean" if method == "mahalanobis" else method
     patterns, variances = _mean_responses(sessions, n_stimuli)
-    sessions = shifted_sessions(sessions, n_stimuli, by_unit=distance != "correlation")
+    if distance != "poisson":
+        sessions = shifted_sessions(sessions, n_stimuli, by_unit=distance != "correlation")
     rdm = SplitRDMs(sessions, n_stimuli, distance).whole()
     halves, r, signal = _split_halves(sessions, n_stimuli, distance, comparison, splits, seed, rdm)
     signal |= _in_time(sessions, n_stimuli, distance, comparison, seed)

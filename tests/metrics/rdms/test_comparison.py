@@ -59,7 +59,7 @@ def test_pairs_missing_in_both_are_left_out_as_in_rsatoolbox(method):
 
 @pytest.mark.parametrize(
     ("method", "reference"),
-    [("pearson", stats.pearsonr), ("spearman", stats.spearmanr)],
+    [("pearson", stats.pearsonr), ("spearman", stats.spearmanr), ("tau-b", stats.kendalltau)],
 )
 def test_a_pair_missing_on_one_side_is_left_out(method, reference):
     a, b = _make_rdms(1, 6, 3)[0], _make_rdms(2, 6, 4)
@@ -80,7 +80,7 @@ def test_layers_permutations_and_animals_broadcast():
 def test_an_rdm_without_differences_has_no_direction(method):
     flat = np.full(15, 0.1) * (1 + 1e-16)
     result = float(compare(flat, _make_rdms(1)[0], method=method))
-    if method == "rho-a":
+    if method in ("rho-a", "tau-a"):
         assert result == 0
     elif "cosine" in method:
         assert np.isfinite(result)

@@ -70,7 +70,9 @@ def _rsatoolbox_rdm(trials, labels, method, **options):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize(("method", "theirs"), [("correlation", "correlation"), ("sqeuclidean", "euclidean")])
+@pytest.mark.parametrize(
+    ("method", "theirs"), [("correlation", "correlation"), ("sqeuclidean", "euclidean"), ("poisson", "poisson")]
+)
 def test_plain_distances_equal_rsatoolbox(method, theirs):
     trials, labels, _ = _make_trials()
     np.testing.assert_allclose(
@@ -134,7 +136,7 @@ def test_a_pair_uses_the_units_recorded_in_both_stimuli():
     np.testing.assert_allclose(rdm(means, [0, 1, 2], method="sqeuclidean"), squared, rtol=1e-12)
 
 
-@pytest.mark.parametrize("method", ["correlation", "sqeuclidean", "mahalanobis"])
+@pytest.mark.parametrize("method", ["correlation", "sqeuclidean", "mahalanobis", "poisson"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_a_complete_pattern_with_a_broken_activation_is_broken_not_missing(value, method):
     patterns = np.random.default_rng(4).gamma(2.0, size=(4, 9))
@@ -206,6 +208,11 @@ def test_the_order_of_trials_units_and_stimuli_is_irrelevant(seed, method):
 def test_misuse_is_told_in_a_sentence(arguments, message):
     with pytest.raises(UsageError, match=message):
         rdm(np.ones((3, 4)), **arguments)
+
+
+def test_negative_rates_are_refused_by_poisson():
+    with pytest.raises(DataError, match="the smallest is -1"):
+        rdm([[1.0, -1.0], [2.0, 0.0]], method="poisson")
 
 
 def test_a_single_unit_has_distances_but_no_correlations():
