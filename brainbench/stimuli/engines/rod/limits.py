@@ -25,8 +25,12 @@ STEADY = 1.0
 would answer to the very bends that they make, and swing."""
 LARGE_BEND = 0.4
 """Bend (rad) of a joint at which it is followed by half."""
+PRESSED = 1e-5, 1e-9
+"""Overlap (mm) at the end of a step, in single and in double precision, from which a place that other contacts press
+upon becomes a contact of the same step. What is left is undone in the next step, by a blow that grows as the step
+shrinks: between opposed objects two contacts would take turns, each thrown off by the other."""
 CLOSED = 1e-3
-"""Overlap (mm) at the end of a step from which a place counts as pressed upon."""
+"""Gap (mm) up to which a place is a candidate, and overlap from which one without room among the contacts is missed."""
 LARGEST_FORCE = 1e6
 """Force (mN) of a contact from which it counts as one that no force can resolve."""
 FEW_ITERATIONS = 1e-4, 8, 8

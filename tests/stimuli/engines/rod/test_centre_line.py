@@ -11,7 +11,7 @@ from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
-from tests.factories.contact_scenes import contact_jobs, difference
+from tests.factories.contact_scenes import HARD_OBJECTS, contact_jobs, difference
 from tests.factories.gradients import touching_job
 from tests.factories.pressed_whiskers import held_job, sliding_job
 from tests.factories.rod_chain import in_double
@@ -75,6 +75,20 @@ def test_edges_of_boxes_press_as_they_do_with_many_links():
         for fidelity in ("accurate,links=60", "accurate")
     )
     assert np.linalg.norm(coarse - fine) < 0.01 * np.linalg.norm(fine)
+
+
+@pytest.mark.parametrize("line", ["rod", "links"])
+def test_opposed_contacts_press_together_in_short_steps(line):
+    """The one that only the other's force presses on must not wait for a step: each would be thrown off in turn."""
+    job = contact_jobs(20, each=1, objects=HARD_OBJECTS)[16]
+    job = dataclasses.replace(job, times=job.times[:40])
+    setting = f"accurate,steps_per_period=none,contact_line={line}"
+    long, short = (
+        get_engine("rod").run([job], Fidelity.parse(f"{setting},time_step={step}"), workers=1)[0]
+        for step in (5e-5, 1e-5)
+    )
+    assert difference(short, long) < 0.002
+    assert short.penetration < 1e-6
 
 
 def test_a_plane_of_bending_is_like_any_other():

@@ -10,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import CLOSED, CREVICE
+from brainbench.stimuli.engines.rod.limits import CLOSED, CREVICE, PRESSED
 
 from .algebra import JointVector, Spatial, inertia_times, minus, plus, reader, spatial, vec3, vec6
 from .articulated_body import acceleration_over_joint, force_over_joint, inverse_times
@@ -457,6 +457,7 @@ def apply_forces(
     # Down again, and where the other candidates are then.
     more = int(0)
     if active == 1:
+        overlap = real(0.0)
         a = Spatial()
         if wp.static(yields):
             given = problems.given[solver.job]
@@ -480,12 +481,14 @@ def apply_forces(
                         moved = candidate.free_velocity + (a.v + wp.cross(a.w, candidate.point)) * solver.step
                         predicted = candidate.gap + solver.step * wp.dot(candidate.normal, moved)
                         problems.predicted_gap[first_candidate + j] = predicted
-                        if predicted < real(-wp.static(CLOSED)):
-                            more = int(1)
+                        overlap = wp.max(overlap, -predicted)
         crowded = int(0)
+        if overlap > real(wp.static(PRESSED[real is wp.float64])):
+            more = int(1)
         if more == 1 and (solver.contacts == wp.static(max_contacts) or last == 1):
             more = int(0)
-            crowded = int(1)
+            if overlap > real(wp.static(CLOSED)):
+                crowded = int(1)
         if more == 0 and solver.thread == 0:
             # Below ten micrometres or one per cent it does not show in the wrench.
             miss = zero
