@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.stimuli.engines.fidelity import Fidelity, steps_to_ring
-from brainbench.stimuli.engines.reach import reachable
 from brainbench.stimuli.engines.trust import SMALL_FORCE, start_jump
 from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.whiskers.whisker import Whisker
@@ -36,12 +35,9 @@ CALM = 1.5
 """Error of such a whisker, which touches nothing, times the square of its links: .023, .012 and .004 for the presets,
 measured .014 to .018, .007 to .008 and .003 to .004 (mouse and rat, 5 and 20 Hz)."""
 ROUNDS = 5  # times that whiskers are simulated again, with more links or shorter steps, to keep a promised error
-SHORT_STEP = 1e-5
-"""Step (s) in which whiskers that may jam are simulated once more before a promise counts as kept. Forces between
-bodies with friction agree within a few per cent in steps from .5 to .05 ms, and change by up to 50 % below 25 µs."""
 MARGIN = 0.8  # share of a promised error from which a whisker is simulated again, since estimates have errors too
 FINEST_STEP = 2e-6  # step (s) below which none is halved to keep a promise: single precision ends there
-RULE = 2  # counts up when the same forces get other errors, so that no data set is made by two rules
+RULE = 3  # counts up when the same forces get other errors, so that no data set is made by two rules
 
 Run = Callable[[Sequence[Job], Fidelity], Sequence[Trace]]  # simulates jobs
 
@@ -52,7 +48,7 @@ def with_errors(run: Run, jobs: Sequence[Job], fidelity: Fidelity, once: Run) ->
     ``run`` simulates each as often as it takes to be trusted, and finer ones ``once``: changes are what they are for.
     Where the fidelity promises an ``error``, whiskers beyond it are simulated again with what errs most made finer, one
     by one. An estimate falls by no more than theory allows: to take the first that happens to be small would favour
-    those that are too small. Where a whisker may jam, short steps must agree as well.
+    those that are too small.
     """
     traces = list(run(jobs, fidelity))
     settings, errors = [fidelity] * len(traces), np.zeros((len(traces), 2))
@@ -88,37 +84,28 @@ def with_errors(run: Run, jobs: Sequence[Job], fidelity: Fidelity, once: Run) ->
         finer: dict[int, Fidelity] = {}
         for index, chosen in pending.items():
             job, trace = jobs[index], runs[index, chosen]
-            changes_by = [_change(job, trace, runs[index, some[index]]) for some in changed]
+            moved = touch_shift(chosen, job.whisker, job.spacing), 0.0
+            pairs = zip(changed, moved, strict=True)
+            changes_by = [_change(job, trace, runs[index, some[index]], shift) for some, shift in pairs]
             # Shares of the errors that the finer setting leaves by theory.
             shorter, more = chosen.time_step < settings[index].time_step, chosen.links > settings[index].links
             least = np.where(np.isfinite(errors[index]), errors[index], 0.0) / (1 + shorter, MORE if more else 1.0)
             errors[index] = np.maximum(np.multiply((HALF_STEP, MORE_LINKS), changes_by), least)
             steps = trace.steps + (traces[index].steps if place else 0)
-            settings[index], error = chosen, math.hypot(*errors[index])
-            traces[index] = replace(traces[index], steps=steps)
+            settings[index], error, best = chosen, math.hypot(*errors[index]), traces[index]
+            if place:  # by what a later run changes it, it may be wrong
+                best = replace(best, error=max(best.error, _change(job, best, trace)))
             # Where none is good enough the best stays: more links in the same steps can make a blow worse.
-            if not (place and (fidelity.error or 0) < traces[index].error < error):
-                traces[index] = replace(trace, error=error, steps=steps)
+            if not (place and (fidelity.error or 0) < best.error < error):
+                best = replace(trace, error=error)
+            traces[index] = replace(best, steps=steps)
             following = _finer(chosen, job, *errors[index])
             if error > MARGIN * (fidelity.error or math.inf) and following != chosen:
                 finer[index] = following
         runs = {(index, setting): trace for (index, setting), trace in runs.items() if finer.get(index) == setting}
         pending = finer
-    promise = fidelity.error or LARGEST_ERROR
-    tried = fidelity.error is not None
+    promise, tried = fidelity.error or LARGEST_ERROR, fidelity.error is not None
     remarks = [remark_on(trace.error, promise, tried=tried) if trace.status == "ok" else "" for trace in traces]
-    if tried and fidelity.solver == "dynamic":
-        short = {
-            index: replace(halved_step(setting, job.whisker, job.spacing), time_step=SHORT_STEP, steps_per_period=None)
-            for index, (job, trace, setting) in enumerate(zip(jobs, traces, settings, strict=True))
-            if trace.error <= promise and setting.step_of(setting.chain(job.whisker)) > SHORT_STEP
-            if may_jam(job, trace)
-        }
-        simulate(short)
-        for index, chosen in short.items():
-            change = _change(jobs[index], traces[index], runs[index, chosen])
-            traces[index] = replace(traces[index], error=max(traces[index].error, change))
-            remarks[index] = remark_on(change, promise, jams=True)
     ratios = [setting.damping_of(job) for setting, job in zip(settings, jobs, strict=True)]
     return [
         replace(trace, damping=ratio, remark=remark, seconds=spent)
@@ -139,28 +126,44 @@ def calm_error(job: Job, trace: Trace, fidelity: Fidelity) -> float:
     return CALM / chain.links**2 if slow else math.nan
 
 
-def may_jam(job: Job, trace: Trace) -> bool:
-    """Return True for a whisker in contact that bodies, or a concave one, may hold from several sides with friction."""
-    if not trace.contact.any():
-        return False
-    bodies = reachable(job.whisker, job.follicle.pose(job.times)[0], job.obstacles, job.times).obstacles
-    rough = any(body.friction_beside(job.whisker.friction) > 0 for body in bodies)
-    return rough and sum(len(body.parts) or 2 for body in bodies) > 1
-
-
 def changes(
-    values: NDArray[np.floating], finer: NDArray[np.floating], contact: NDArray[np.bool_], lengths: NDArray[np.floating]
+    values: NDArray[np.floating],
+    finer: NDArray[np.floating],
+    contact: NDArray[np.bool_],
+    lengths: NDArray[np.floating],
+    shift: NDArray[np.floating] | float = 0.0,
 ) -> NDArray[np.float64]:
     """Return the share [n] by which finer simulations change base force or moment, whichever is larger.
 
     The blow that undoes an overlap at the start is the larger the shorter the step; it is no error. What changes where
-    contact begins or ends counts :data:`BESIDE_TOUCH` times. Arguments are those of :func:`difference`.
+    contact begins or ends counts :data:`BESIDE_TOUCH` times, and is at least what a ``shift`` [n] of that instant
+    (:func:`touch_shift`) does. Other arguments are those of :func:`difference`.
     """
     calm = ~start_jump(values[:, :, None, :3], finer[:, :, None, :3])[:, :, 0]
-    ends = contact[:, 1:] != contact[:, :-1]
-    beside = np.pad(ends, ((0, 0), (0, 1))) | np.pad(ends, ((0, 0), (1, 0)))
-    counted = finer + np.where(beside, BESIDE_TOUCH, 1.0)[:, :, None] * (values - finer)
+    beside, course = (
+        np.maximum(np.pad(part, ((0, 0), (0, 1), (0, 0))), np.pad(part, ((0, 0), (1, 0), (0, 0))))
+        for part in (contact[:, 1:, None] != contact[:, :-1, None], _sizes(np.diff(finer, axis=1)))
+    )
+    gaps = _sizes(values - finer)
+    least = np.broadcast_to(shift, len(values))[:, None, None] * course
+    gaps = np.where(beside, BESIDE_TOUCH * np.maximum(gaps, least), gaps)
+    counted = finer.astype(float)
+    counted[:, :, ::3] += gaps
     return difference(counted, finer, contact, lengths, calm).max(axis=1)
+
+
+def touch_shift(fidelity: Fidelity, whisker: Whisker, spacing: float) -> float:
+    """Return by what share of the time between two readings (``spacing``, s) half the step may move a touch.
+
+    The wave that runs through a whisker from a touch is shorter than a long step. No such step shows it, and half the
+    step changes a reading in it by much less than its error.
+    """
+    return min(fidelity.step_of(fidelity.chain(whisker)) / spacing, 1.0) / 2
+
+
+def _sizes(wrenches: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return the sizes [n, t, 2] of forces and moments [n, t, 6]."""
+    return np.linalg.norm(wrenches.reshape(*wrenches.shape[:2], 2, 3), axis=-1)
 
 
 def difference(
@@ -214,12 +217,12 @@ def more_links(fidelity: Fidelity, whisker: Whisker) -> Fidelity:
     return replace(fidelity, links=changed if changed <= MOST else round(count / MORE), links_per_mm=None)
 
 
-def _change(job: Job, trace: Trace, finer: Trace) -> float:
+def _change(job: Job, trace: Trace, finer: Trace, shift: float = 0.0) -> float:
     """Return the share by which a finer run changes a trace; infinite where it cannot be trusted."""
     if finer.status != "ok":
         return math.inf
     contact, length = (trace.contact | finer.contact)[None], np.array([job.whisker.arc_length])
-    return float(changes(trace.wrench[None], finer.wrench[None], contact, length)[0])
+    return float(changes(trace.wrench[None], finer.wrench[None], contact, length, shift)[0])
 
 
 def _finer(fidelity: Fidelity, job: Job, by_step: float, by_links: float) -> Fidelity:
@@ -231,7 +234,7 @@ def _finer(fidelity: Fidelity, job: Job, by_step: float, by_links: float) -> Fid
     return fidelity
 
 
-def remark_on(error: float, promise: float = LARGEST_ERROR, *, jams: bool = False, tried: bool = False) -> str:
+def remark_on(error: float, promise: float = LARGEST_ERROR, *, tried: bool = False) -> str:
     """Return in words that an estimated error is beyond what is promised; empty where it is not.
 
     Where finer settings were ``tried``, as ``auto`` does, they are no advice.
@@ -239,8 +242,5 @@ def remark_on(error: float, promise: float = LARGEST_ERROR, *, jams: bool = Fals
     if not error > promise:
         return ""
     words = f"an error of {error:.0%}" if np.isfinite(error) else "an error that cannot be told"
-    words += f" (root mean square), above {promise:.0%}"
-    if jams:
-        return f"steps of {1e3 * SHORT_STEP:g} ms tell {words}; between bodies with friction forces may have no limit"
     advice = "auto has no finer setting that helps" if tried else "choose a finer fidelity, or auto=ERROR"
-    return f"half the step and more links estimate {words}; {advice}"
+    return f"half the step and more links estimate {words} (root mean square), above {promise:.0%}; {advice}"

@@ -12,13 +12,13 @@ from brainbench.stimuli import Fidelity, WhiskerArray
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.error_estimates import (
     CALM,
-    SHORT_STEP,
     SLOW,
     calm_error,
     changes,
     difference,
     halved_step,
     more_links,
+    touch_shift,
     with_errors,
 )
 from brainbench.stimuli.engines.fidelity import list_presets
@@ -204,12 +204,13 @@ def test_an_estimate_that_happens_to_be_small_is_not_believed():
 def test_where_no_run_is_good_enough_the_forces_are_those_of_the_best():
     def run(jobs, setting):
         # More links in the same steps make it worse.
-        return [_trace({10: 0.0, 15: 0.1}.get(setting.links, 0.6)) for _ in jobs]
+        return [_trace({10: 0.0, 15: 0.1, 23: 0.6, 35: 1.2, 53: 2.4}.get(setting.links, 5.0)) for _ in jobs]
 
     (trace,) = with_errors(run, [Job(C2, StillFollicle(), (), TIMES)], Fidelity(links=10, error=0.05), run)
-    assert trace.error == pytest.approx(3 * 0.1 / 1.1)
+    # The worst changes it by more than its own estimate, 27 %.
+    assert trace.error == pytest.approx(2.4 / 3.4)
     np.testing.assert_array_equal(trace.wrench, _trace().wrench)
-    assert "an error of 27%" in trace.remark
+    assert "an error of 71%" in trace.remark
 
 
 def test_what_changes_where_contact_begins_or_ends_counts_by_the_root_of_the_step():
@@ -225,31 +226,18 @@ def test_what_changes_where_contact_begins_or_ends_counts_by_the_root_of_the_ste
     np.testing.assert_allclose(told, plain * [1, 1.7, 1.7, 1, 1, 1.7, 1.7, 1], rtol=1e-2)
 
 
-@pytest.mark.parametrize(
-    ("friction", "posts", "fidelity", "error"),
-    [
-        (0.4, (1, -1), Fidelity(error=0.1), 0.3),
-        (0.4, (1, -1), Fidelity(error=0.5), 0.3),
-        (0.4, (1, -1), Fidelity(), 0.0),
-        (0.4, (1, -1), Fidelity(error=0.1, time_step=1e-3, solver="quasistatic"), 0.0),
-        (0.4, (1, -1), Fidelity(error=0.1, steps_per_period=1e4), 0.0),
-        (0.4, (1,), Fidelity(error=0.1), 0.0),
-        (0.0, (1, -1), Fidelity(error=0.1), 0.0),
-        (0.4, (1, -100), Fidelity(error=0.1), 0.0),
-    ],
-)
-def test_a_promise_is_kept_only_where_short_steps_agree_between_rough_bodies(friction, posts, fidelity, error):
-    places = [(0.01, 1e-3 * side, 0.0) for side in posts]
-    bodies = tuple(Obstacle((Sphere(place, 5e-4),), None, friction) for place in places)
-
-    def run(jobs, setting):
-        # Steps that resolve a vibration give other forces, as no longer ones do.
-        return [_trace(0.3 / 0.7 if setting.time_step <= SHORT_STEP else 0.0) for _ in jobs]
-
-    (trace,) = with_errors(run, [Job(C2, StillFollicle(), bodies, TIMES)], fidelity, run)
-    assert trace.error == pytest.approx(error)
-    assert trace.status == "ok"
-    assert ("no limit" in trace.remark) == (error > (fidelity.error or 1))
+def test_a_touch_may_come_half_a_step_earlier():
+    """Half the step changes nothing here, as where neither shows the wave that runs through a whisker from a touch."""
+    contact = np.arange(8)[None] >= 3
+    values = np.zeros((1, 8, 6))
+    values[0, :, 5] = np.where(contact[0], [0, 0, 0, 2e-6, 6e-6, 6e-6, 6e-6, 6e-6], 0)
+    fidelity = Fidelity(links=10, time_step=5e-4)
+    shifts = [touch_shift(replace(fidelity, time_step=step), C2, 1e-3) for step in (2e-3, 5e-4, 1e-4)]
+    np.testing.assert_allclose(shifts, [0.5, 0.25, 0.05])
+    told = [changes(values, values, contact, np.array([0.01]), shift)[0] for shift in (0.0, *shifts)]
+    # Beside the touch are the last reading before, whose moment changes by 2e-6 to the next, and the first.
+    plain = 1.7 * np.hypot(2e-6, 4e-6) / np.sqrt(2**2 + 4 * 6**2) / 1e-6
+    np.testing.assert_allclose(told, plain * np.array([0, *shifts]), rtol=1e-6)
 
 
 def test_differences_are_relative_above_a_nanonewton_and_of_force_or_moment():

@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 from brainbench.core.devices import pick_device
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import base_rotation, euler_matrix, from_matrices
-from brainbench.stimuli.engines.error_estimates import HALF_STEP, MORE_LINKS, changes, halved_step, more_links
+from brainbench.stimuli.engines.error_estimates import (
+    HALF_STEP,
+    MORE_LINKS,
+    changes,
+    halved_step,
+    more_links,
+    touch_shift,
+)
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import PassiveSweeps, SweepBatch, describe_unstable, join_batches
 from brainbench.stimuli.engines.rod.launch import (
@@ -73,6 +80,7 @@ class SweepLauncher:
         sliced = bool(self.device.is_cuda) if sliced is None else sliced
         bounds = SLICED_BOUNDS if sliced else BOUNDS
         self.scenes, self.grid = scenes, grid
+        self.spacing = float(np.median(np.diff(grid.frames.readings, prepend=0.0)))
         mounts = list(scenes.array)
         self.whiskers = [mount.whisker for mount in mounts]
         self._solver_of = partial(
@@ -101,9 +109,8 @@ class SweepLauncher:
     @cached_property
     def finer(self) -> list[tuple[float, WhiskerSolver]]:
         """Solvers whose forces tell the error (:mod:`..error_estimates`), and what their changes are multiplied by."""
-        spacing = float(np.median(np.diff(self.grid.frames.readings, prepend=0.0)))
         least = min(self.whiskers, key=lambda whisker: whisker.damping_ratio)
-        half, chains = halved_step(self.fidelity, least, spacing), self.solver.chains
+        half, chains = halved_step(self.fidelity, least, self.spacing), self.solver.chains
         longer = [more_links(self.fidelity, whisker).chain(whisker) for whisker in self.whiskers]
         return [(HALF_STEP, self._solver_of(chains, half)), (MORE_LINKS, self._solver_of(longer, self.fidelity))]
 
@@ -207,7 +214,7 @@ class SweepLauncher:
         values, contact = result.wrench[row, :, whisker], result.contact[row, :, whisker] >= 0
         lengths = np.array([one.arc_length for one in self.whiskers])[whisker]
 
-        def square(factor: float, solver: WhiskerSolver) -> NDArray[np.float64]:
+        def square(factor: float, solver: WhiskerSolver, shift: NDArray[np.float64] | float) -> NDArray[np.float64]:
             def launch(divisors: NDArray[np.integer]) -> LaunchResult:
                 whole = np.zeros_like(result.divisor)
                 whole[which] = divisors
@@ -220,16 +227,17 @@ class SweepLauncher:
             left = finer.verdict.retryable.copy()
             if left.any():
                 finer = finer.replaced(left, launch(np.where(left[:, 0], 2 * divisors, 0)))
-            change = changes(values, finer.wrench[:, :, 0], contact | (finer.contact[:, :, 0] >= 0), lengths)
+            change = changes(values, finer.wrench[:, :, 0], contact | (finer.contact[:, :, 0] >= 0), lengths, shift)
             return np.where(finer.verdict.unstable[:, 0], np.inf, factor * change) ** 2
 
         # A GPU simulates both at the same time.
         half, longer = self.finer
+        shift = np.array([touch_shift(self.fidelity, one, self.spacing) for one in self.whiskers])[whisker]
         if self.device.is_cuda:
-            coming = _helpers().submit(square, *longer)
-            squares = square(*half) + coming.result()
+            coming = _helpers().submit(square, *longer, 0.0)
+            squares = square(*half, shift) + coming.result()
         else:
-            squares = square(*half) + square(*longer)
+            squares = square(*half, shift) + square(*longer, 0.0)
         error[which] = np.sqrt(squares)
         return error
 

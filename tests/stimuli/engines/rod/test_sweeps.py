@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.stimuli.engines.error_estimates import HALF_STEP, MORE_LINKS, changes
+from brainbench.stimuli.engines.error_estimates import HALF_STEP, MORE_LINKS, changes, touch_shift
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
 from brainbench.stimuli.objects.collections import resolve_objects
@@ -100,9 +100,13 @@ def test_the_error_of_a_whisker_in_finer_steps_is_told_by_half_of_these():
         run, *finer = (launcher.launch(chosen, [(which, divisor)], solver) for solver in (None, *_finer(launcher)))
         assert run.wrench[0, :, 0].tobytes() == batch.wrench[0, :, column].tobytes()
         touching = [each.contact[:, :, 0] >= 0 for each in (run, *finer)]
+        shift = touch_shift(launcher.fidelity, launcher.whiskers[column], launcher.spacing)
+        wrenches = [each.wrench[:, :, 0] for each in (run, *finer)]
         shares = [
-            factor * changes(run.wrench[:, :, 0], each.wrench[:, :, 0], touching[0] | there, lengths[[column]])[0]
-            for factor, each, there in zip((HALF_STEP, MORE_LINKS), finer, touching[1:], strict=True)
+            factor * changes(wrenches[0], each, touching[0] | there, lengths[[column]], moved)[0]
+            for factor, each, there, moved in zip(
+                (HALF_STEP, MORE_LINKS), wrenches[1:], touching[1:], (shift, 0.0), strict=True
+            )
         ]
         assert batch.error[0, column] == pytest.approx(np.hypot(*shares), rel=1e-5)
 
