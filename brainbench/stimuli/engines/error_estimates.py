@@ -47,12 +47,10 @@ def with_errors(run: Run, jobs: Sequence[Job], fidelity: Fidelity, once: Run) ->
 
     ``run`` simulates each as often as it takes to be trusted, and finer ones ``once``: changes are what they are for.
     Where the fidelity promises an ``error``, whiskers beyond it are simulated again with what errs most made finer, one
-    by one. An estimate falls by no more than theory allows: to take the first that happens to be small would favour
-    those that are too small.
+    by one.
     """
     traces = list(run(jobs, fidelity))
-    settings, errors = [fidelity] * len(traces), np.zeros((len(traces), 2))
-    seconds = [trace.seconds for trace in traces]
+    settings, seconds = [fidelity] * len(traces), [trace.seconds for trace in traces]
     runs: dict[tuple[int, Fidelity], Trace] = {}
 
     def simulate(chosen: Mapping[int, Fidelity]) -> None:
@@ -84,22 +82,19 @@ def with_errors(run: Run, jobs: Sequence[Job], fidelity: Fidelity, once: Run) ->
         finer: dict[int, Fidelity] = {}
         for index, chosen in pending.items():
             job, trace = jobs[index], runs[index, chosen]
-            moved = touch_shift(chosen, job.whisker, job.spacing), 0.0
-            pairs = zip(changed, moved, strict=True)
-            changes_by = [_change(job, trace, runs[index, some[index]], shift) for some, shift in pairs]
-            # Shares of the errors that the finer setting leaves by theory.
-            shorter, more = chosen.time_step < settings[index].time_step, chosen.links > settings[index].links
-            least = np.where(np.isfinite(errors[index]), errors[index], 0.0) / (1 + shorter, MORE if more else 1.0)
-            errors[index] = np.maximum(np.multiply((HALF_STEP, MORE_LINKS), changes_by), least)
+            shifts = touch_shift(chosen, job.whisker, job.spacing), 0.0
+            pairs = zip(changed, shifts, strict=True)
+            by_step, by_links = (_change(job, trace, runs[index, some[index]], shift) for some, shift in pairs)
+            by_step, by_links = HALF_STEP * by_step, MORE_LINKS * by_links
             steps = trace.steps + (traces[index].steps if place else 0)
-            settings[index], error, best = chosen, math.hypot(*errors[index]), traces[index]
+            settings[index], error, best = chosen, math.hypot(by_step, by_links), traces[index]
             if place:  # by what a later run changes it, it may be wrong
                 best = replace(best, error=max(best.error, _change(job, best, trace)))
             # Where none is good enough the best stays: more links in the same steps can make a blow worse.
             if not (place and (fidelity.error or 0) < best.error < error):
                 best = replace(trace, error=error)
             traces[index] = replace(best, steps=steps)
-            following = _finer(chosen, job, *errors[index])
+            following = _finer(chosen, job, by_step, by_links)
             if error > MARGIN * (fidelity.error or math.inf) and following != chosen:
                 finer[index] = following
         runs = {(index, setting): trace for (index, setting), trace in runs.items() if finer.get(index) == setting}

@@ -180,25 +180,18 @@ def test_a_promise_makes_only_those_finer_that_need_it():
     assert max(links for rat, links in counts if rat) > 30
 
 
-def test_an_estimate_that_happens_to_be_small_is_not_believed():
+def test_the_finer_run_of_an_estimate_is_the_next_to_be_judged():
     runs = []
 
     def run(jobs, setting):
         runs.append(setting)
-        # More than twelve links err alike, as whiskers do that stick in another place than the true one.
-        return [_trace(0.1 if setting.links < 12 else 0.0) for _ in jobs]
+        return [_trace({10: 0.0, 15: 0.2, 23: 0.25}.get(setting.links, 0.26)) for _ in jobs]
 
     (trace,) = with_errors(run, [Job(C2, StillFollicle(), (), TIMES)], Fidelity(links=10, error=0.05), run)
-    first = 3 * 0.1
-    assert trace.error == pytest.approx(first / 1.5**4)
-    # What was tried already is no advice.
-    assert ("above 5%" in trace.remark, "auto=ERROR" in trace.remark) == (True, False)
-    # The second estimate, .2, is within the promise, but not by the margin.
-    (trace,) = with_errors(run, [Job(C2, StillFollicle(), (), TIMES)], Fidelity(links=10, error=0.21), run)
-    assert trace.error == pytest.approx(first / 1.5**2)
-    assert not trace.remark
-    # The finer run of an estimate is the next to be judged; none is made twice.
-    assert [setting.links for setting in runs[-7:]] == [10, 10, 15, 15, 23, 23, 35]
+    assert trace.error == pytest.approx(3 * 0.01 / 1.26)
+    assert (trace.wrench == _trace(0.25).wrench).all()
+    # None is made twice.
+    assert [setting.links for setting in runs] == [10, 10, 15, 15, 23, 23, 35]
 
 
 def test_where_no_run_is_good_enough_the_forces_are_those_of_the_best():
@@ -208,7 +201,7 @@ def test_where_no_run_is_good_enough_the_forces_are_those_of_the_best():
 
     (trace,) = with_errors(run, [Job(C2, StillFollicle(), (), TIMES)], Fidelity(links=10, error=0.05), run)
     # The worst changes it by more than its own estimate, 27 %.
-    assert trace.error == pytest.approx(2.4 / 3.4)
+    assert trace.error == pytest.approx(2.4 / 3.4)  # the last
     np.testing.assert_array_equal(trace.wrench, _trace().wrench)
     assert "an error of 71%" in trace.remark
 
