@@ -1,8 +1,7 @@
 """The law of the room: every force carries its error, estimated from finer simulations of the same whisker.
 
 A whisker is simulated with half the step (and contact forces solved to :data:`TOLERANCE`), and with half as many links
-again. What each changes says how far the limit is. Contacts push along straight links, so a change of the links turns
-forces between opposed contacts at random, and no change of the step shows it.
+again. What each changes says how far the limit is.
 """
 
 from __future__ import annotations
@@ -82,10 +81,9 @@ def with_errors(run: Run, jobs: Sequence[Job], fidelity: Fidelity, once: Run) ->
         finer: dict[int, Fidelity] = {}
         for index, chosen in pending.items():
             job, trace = jobs[index], runs[index, chosen]
-            shifts = touch_shift(chosen, job.whisker, job.spacing), 0.0
-            pairs = zip(changed, shifts, strict=True)
-            by_step, by_links = (_change(job, trace, runs[index, some[index]], shift) for some, shift in pairs)
-            by_step, by_links = HALF_STEP * by_step, MORE_LINKS * by_links
+            half, longer = (runs[index, some[index]] for some in changed)
+            by_step = HALF_STEP * _change(job, trace, half, lateness(chosen, job.whisker, job.spacing))
+            by_links = MORE_LINKS * _change(job, trace, longer)
             steps = trace.steps + (traces[index].steps if place else 0)
             settings[index], error, best = chosen, math.hypot(by_step, by_links), traces[index]
             if place:  # by what a later run changes it, it may be wrong
@@ -132,7 +130,7 @@ def changes(
 
     The blow that undoes an overlap at the start is the larger the shorter the step; it is no error. What changes where
     contact begins or ends counts :data:`BESIDE_TOUCH` times, and is at least what a ``shift`` [n] of that instant
-    (:func:`touch_shift`) does. Other arguments are those of :func:`difference`.
+    (:func:`lateness`) does. Other arguments are those of :func:`difference`.
     """
     calm = ~start_jump(values[:, :, None, :3], finer[:, :, None, :3])[:, :, 0]
     beside, course = (
@@ -147,7 +145,7 @@ def changes(
     return difference(counted, finer, contact, lengths, calm).max(axis=1)
 
 
-def touch_shift(fidelity: Fidelity, whisker: Whisker, spacing: float) -> float:
+def lateness(fidelity: Fidelity, whisker: Whisker, spacing: float) -> float:
     """Return by what share of the time between two readings (``spacing``, s) half the step may move a touch.
 
     The wave that runs through a whisker from a touch is shorter than a long step. No such step shows it, and half the

@@ -17,8 +17,8 @@ from brainbench.stimuli.engines.error_estimates import (
     changes,
     difference,
     halved_step,
+    lateness,
     more_links,
-    touch_shift,
     with_errors,
 )
 from brainbench.stimuli.engines.fidelity import list_presets
@@ -225,7 +225,7 @@ def test_a_touch_may_come_half_a_step_earlier():
     values = np.zeros((1, 8, 6))
     values[0, :, 5] = np.where(contact[0], [0, 0, 0, 2e-6, 6e-6, 6e-6, 6e-6, 6e-6], 0)
     fidelity = Fidelity(links=10, time_step=5e-4)
-    shifts = [touch_shift(replace(fidelity, time_step=step), C2, 1e-3) for step in (2e-3, 5e-4, 1e-4)]
+    shifts = [lateness(replace(fidelity, time_step=step), C2, 1e-3) for step in (2e-3, 5e-4, 1e-4)]
     np.testing.assert_allclose(shifts, [0.5, 0.25, 0.05])
     told = [changes(values, values, contact, np.array([0.01]), shift)[0] for shift in (0.0, *shifts)]
     # Beside the touch are the last reading before, whose moment changes by 2e-6 to the next, and the first.

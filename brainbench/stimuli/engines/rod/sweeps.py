@@ -18,14 +18,7 @@ from numpy.typing import NDArray
 from brainbench.core.devices import pick_device
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import base_rotation, euler_matrix, from_matrices
-from brainbench.stimuli.engines.error_estimates import (
-    HALF_STEP,
-    MORE_LINKS,
-    changes,
-    halved_step,
-    more_links,
-    touch_shift,
-)
+from brainbench.stimuli.engines.error_estimates import HALF_STEP, MORE_LINKS, changes, halved_step, lateness, more_links
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import PassiveSweeps, SweepBatch, describe_unstable, join_batches
 from brainbench.stimuli.engines.rod.launch import (
@@ -232,7 +225,7 @@ class SweepLauncher:
 
         # A GPU simulates both at the same time.
         half, longer = self.finer
-        shift = np.array([touch_shift(self.fidelity, one, self.spacing) for one in self.whiskers])[whisker]
+        shift = np.array([lateness(self.fidelity, one, self.spacing) for one in self.whiskers])[whisker]
         if self.device.is_cuda:
             coming = _helpers().submit(square, *longer, 0.0)
             squares = square(*half, shift) + coming.result()

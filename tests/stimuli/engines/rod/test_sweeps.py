@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.stimuli.engines.error_estimates import HALF_STEP, MORE_LINKS, changes, touch_shift
+from brainbench.stimuli.engines.error_estimates import HALF_STEP, MORE_LINKS, changes, lateness
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
 from brainbench.stimuli.objects.collections import resolve_objects
@@ -100,7 +100,7 @@ def test_the_error_of_a_whisker_in_finer_steps_is_told_by_half_of_these():
         run, *finer = (launcher.launch(chosen, [(which, divisor)], solver) for solver in (None, *_finer(launcher)))
         assert run.wrench[0, :, 0].tobytes() == batch.wrench[0, :, column].tobytes()
         touching = [each.contact[:, :, 0] >= 0 for each in (run, *finer)]
-        shift = touch_shift(launcher.fidelity, launcher.whiskers[column], launcher.spacing)
+        shift = lateness(launcher.fidelity, launcher.whiskers[column], launcher.spacing)
         wrenches = [each.wrench[:, :, 0] for each in (run, *finer)]
         shares = [
             factor * changes(wrenches[0], each, touching[0] | there, lengths[[column]], moved)[0]
