@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -182,15 +183,27 @@ class Room:
     problems: Any
     results: Any
 
+    @cached_property
+    def views(self) -> tuple[list[dict[str, NDArray]], list[NDArray]]:
+        """What the structures of the scene hold, and what those of contact problems and results hold.
+
+        Warp takes longer to find an array's memory than to write it.
+        """
+        held = [
+            {name: array.numpy() for name, array in vars(struct).items() if isinstance(array, warp().array)}
+            for struct in (*self.scene, self.problems, self.results)
+        ]
+        return held[: len(self.scene)], [view for views in held[len(self.scene) :] for view in views.values()]
+
     def refill(self, parts: Mapping[Any, Mapping[str, NDArray]]) -> None:
         """Upload what the structures of the scene hold, and clear those of contact problems and results."""
-        for struct, part in zip(self.scene, parts.values(), strict=True):
+        scene, rest = self.views
+        for views, part in zip(scene, parts.values(), strict=True):
             for name, values in part.items():
                 if values.size:
-                    getattr(struct, name).numpy()[...] = values
-        for array in (*vars(self.problems).values(), *vars(self.results).values()):
-            if isinstance(array, warp().array):
-                array.zero_()
+                    views[name][...] = values
+        for view in rest:
+            view.fill(0)
 
 
 @dataclass(eq=False)
