@@ -39,7 +39,7 @@ def free(device_name: str, lanes: int, links: int, steps: int, twists: bool) -> 
     for _ in range(4):
         given = Launch(jobs, motions, shapes, np.array([steps * step]), (lanes, 1), gravity=gravity)
         result = solver.launch(given)
-        kernels.append(result.seconds["kernel"])
+        kernels.append(result.seconds)
     seconds = statistics.median(kernels[1:])
     print(
         f"free  N={links} {'twist' if twists else 'bending'} single lanes={lanes}: "

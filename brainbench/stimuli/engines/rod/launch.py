@@ -184,26 +184,20 @@ class Room:
     results: Any
 
     @cached_property
-    def views(self) -> tuple[list[dict[str, NDArray]], list[NDArray]]:
-        """What the structures of the scene hold, and what those of contact problems and results hold.
-
-        Warp takes longer to find an array's memory than to write it.
-        """
-        held = [
-            {name: array.numpy() for name, array in vars(struct).items() if isinstance(array, warp().array)}
-            for struct in (*self.scene, self.problems, self.results)
-        ]
-        return held[: len(self.scene)], [view for views in held[len(self.scene) :] for view in views.values()]
+    def views(self) -> list[dict[str, NDArray]]:
+        """What the structures of the scene hold, then contact problems and results: Warp takes long to look it up."""
+        parts, kind = (*self.scene, self.problems, self.results), warp().array
+        return [{key: array.numpy() for key, array in vars(part).items() if isinstance(array, kind)} for part in parts]
 
     def refill(self, parts: Mapping[Any, Mapping[str, NDArray]]) -> None:
         """Upload what the structures of the scene hold, and clear those of contact problems and results."""
-        scene, rest = self.views
-        for views, part in zip(scene, parts.values(), strict=True):
+        for views, part in zip(self.views, parts.values(), strict=False):
             for name, values in part.items():
                 if values.size:
                     views[name][...] = values
-        for view in rest:
-            view.fill(0)
+        for views in self.views[len(parts) :]:
+            for view in views.values():
+                view.fill(0)
 
 
 @dataclass(eq=False)
@@ -232,8 +226,8 @@ class LaunchResult:
     """[row, reading, node, 3] joints and tip (m) from the base point, when shapes were asked for."""
     contact_wrench: NDArray[np.floating] | None = None
     """[row, reading, 6] force and moment of all contacts (N, N·m), when shapes were asked for."""
-    seconds: dict[str, float] = field(default_factory=dict)
-    """Elapsed time of ``upload``, ``kernel`` and ``download``."""
+    seconds: float = 0.0
+    """Elapsed time of the kernels."""
 
     @property
     def steps(self) -> NDArray[np.int32]:
@@ -355,16 +349,14 @@ class WhiskerSolver:
     def launch(self, given: Launch) -> LaunchResult:
         """Simulate jobs."""
         device, jobs, size = self.device, given.jobs, given.size
-        clock = [time.perf_counter()]
         scene, problems, results, shapes_of = self._upload(given)
-        clock.append(time.perf_counter())
+        started = time.perf_counter()
         stream = self._take_steps(scene, problems, results, jobs)
-        clock.append(time.perf_counter())
+        seconds = time.perf_counter() - started
         values = download({name: getattr(results, name) for name in shapes_of}, stream)
         with lock_of(device):
             # What a GPU holds of this launch is given back under the lock too.
             del scene, problems, results
-        clock.append(time.perf_counter())
 
         def table(column: NDArray) -> NDArray:
             whole = np.zeros(size, dtype=column.dtype)
@@ -394,8 +386,7 @@ class WhiskerSolver:
             third=np.partition(force, -3, axis=1)[:, -3] if len(given.readings) >= FEWEST_READINGS else peak,
         )
         result = LaunchResult(wrench, values["contact"], counts, depth, missed, judge(facts), table(jobs.finer))
-        result.displacement = values.get("displacement")
-        result.seconds = dict(zip(("upload", "kernel", "download"), np.diff(clock).tolist(), strict=True))
+        result.displacement, result.seconds = values.get("displacement"), seconds
         if given.record_shape:
             result.points = np.moveaxis(values["points"].astype(float) / MILLI, 2, 0)
             forces = values["contact_wrench"].astype(float)
@@ -463,7 +454,8 @@ class WhiskerSolver:
                 # Whiskers that are simulated again go first: others wait for them.
                 urgent = bool((jobs.finer > 1).all())
                 slices = Slices(self.kernels, self.capacity, count, device, urgent=urgent, **self.tuning)
-            self.slices = slices.run(scene, problems, results, self.block["block_dim"])
+            with slices.turn:
+                self.slices = slices.run(scene, problems, results, self.block["block_dim"])
             return slices.stream
         with lock_of(device):
             inputs = [*scene, problems, self.kernels.structs.PausedWhiskers(), results]
