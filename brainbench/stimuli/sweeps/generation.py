@@ -52,17 +52,14 @@ from brainbench.stimuli.sweeps.plan import (
     ShardTask,
     build_object,
     make_shard,
-    simulate_shard,
     warm_up,
-    write_shard,
 )
 
 Done = Callable[[int], None]  # called with the number of sweeps of a shard that is written
 
 SIDE_BY_SIDE = 32
 """Most shards that are made on one GPU at the same time. Whiskers that are simulated again are few and take many steps
-one after the other, however idle the GPU is, which meanwhile computes those of other shards, whose turn is a matter of
-:data:`brainbench.stimuli.engines.rod.slices.FIRST_AT_ONCE`."""
+one after the other, however idle the GPU is, which meanwhile simulates those of other shards for the first time."""
 WHISKER_BYTES = 10_000, 32
 """Room on a GPU for a whisker of a sweep, and for each of its frames more: state, contacts and results."""
 AHEAD = 4
@@ -157,10 +154,6 @@ def run_pipelined(tasks: Sequence[ShardTask], folder: Path, workers: int, done: 
 
     The objects of some shards ahead (:data:`AHEAD`) and the forces of :data:`SIDE_BY_SIDE` shards are in memory.
     """
-
-    def make(task: ShardTask, objects: Sequence[BuiltObject]) -> int:
-        return write_shard(simulate_shard(task, objects, workers), folder)
-
     most = min(_shards_at_once(tasks[0]), len(tasks))
     making: set[Future[int]] = set()
     processes = min(workers, max(len(tasks), sum(len(task.objects) for task in tasks) // STARTING))
@@ -170,7 +163,7 @@ def run_pipelined(tasks: Sequence[ShardTask], folder: Path, workers: int, done: 
                 # Fails where the first shard will fail, which tells of it.
                 threads.submit(warm_up, tasks[0])
                 for task, objects in _built_ahead(tasks, builders, processes):
-                    making.add(threads.submit(make, task, objects))
+                    making.add(threads.submit(make_shard, task, str(folder), workers, objects))
                     del objects
                     if len(making) == most:
                         ended, making = wait(making, return_when=FIRST_COMPLETED)

@@ -33,18 +33,21 @@ POLL = 4e-4  # time (s) between two looks at whether a GPU is done
 LONG = 10_000  # looks after which the GPU is asked with Warp's own call, which tells of a failure
 PIECE = 2**21  # numbers that are copied to the host under one hold of the lock: some 2 ms
 
-FIRST_AT_ONCE = 3
-"""Launches of whiskers that are simulated for the first time, side by side: these fill a GPU, and the sooner they are
-through, the sooner begin those again, which take long however idle it is."""
+FIRST = threading.Semaphore(3)
+"""Launches side by side of whiskers that are simulated for the first time: they fill a GPU."""
 
 _LOCK = threading.RLock()
-_FIRST = threading.Semaphore(FIRST_AT_ONCE)
 _OWN = threading.local()
 
 
 def lock_of(device: Any) -> AbstractContextManager[Any]:
     """Return what a thread holds while it calls Warp for a device; threads on a processor need not wait."""
     return _LOCK if device.is_cuda else nullcontext()
+
+
+def turn_of(device: Any, urgent: bool) -> AbstractContextManager[Any]:
+    """Return what a thread holds while its slices run: whiskers that are simulated again (``urgent``) need not wait."""
+    return FIRST if device.is_cuda and not urgent else nullcontext()
 
 
 def streams_of(device: Any, side: int, priority: int) -> tuple[Any, list[Any], list[tuple[Any, Any]]]:
@@ -158,8 +161,7 @@ class Slices:
         size = np.zeros(3, dtype=np.int32)
         size[AFTER_OTHERS] = lanes
         on.queue, on.queue_size = (wp.array(values, device=device) for values in (queue, size))
-        self.turn = nullcontext() if urgent or not device.is_cuda else _FIRST
-        """What a thread holds while they run."""
+        self.turn = turn_of(device, urgent)
 
     def run(self, scene: SceneParts, problems: Any, results: Any, block: int) -> int:
         """Take all whiskers to their end with ``block`` threads of a block; return the number of slices."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import numpy as np
@@ -91,6 +92,20 @@ def test_threads_that_take_turns_on_a_gpu_get_what_one_alone_gets(as_a_gpu):
             np.testing.assert_array_equal(together[name].counts[field], values)
 
 
+def test_whiskers_that_are_simulated_again_do_not_wait_for_those_of_first_launches(as_a_gpu, monkeypatch):
+    gpu, processor = SimpleNamespace(is_cuda=True), SimpleNamespace(is_cuda=False)
+    assert slices.turn_of(gpu, False) is slices.turn_of(gpu, False) is slices.FIRST
+    assert not {slices.FIRST} & {slices.turn_of(gpu, True), slices.turn_of(processor, False)}
+    turns = []
+    monkeypatch.setattr(slices, "turn_of", lambda device, urgent: turns.append(urgent) or nullcontext())
+    objects = resolve_objects(["brick-0"], surfaces=True)
+    scenes = SweepScenes(GRIDS["thesis-high"], {name: item.load for name, item in objects.items()}, whiskers="C1,C2,D2")
+    launcher = SweepLauncher(scenes, Fidelity(links=12, time_step=1e-3), sliced=True)
+    batch = launcher.trusted([("brick-0", scenes.grid.sweeps("brick-0")[74:76])], 5)
+    assert batch.retried > 0
+    assert turns == [False] + [True] * (len(turns) - 1) != [False]
+
+
 def test_sweeps_are_placed_as_ever(monkeypatch):
     objects = resolve_objects(["brick-0", "torus-0"], surfaces=True)
     scenes = SweepScenes(GRIDS["thesis-high"], {name: item.load for name, item in objects.items()}, whiskers="C1,C2")
@@ -102,7 +117,7 @@ def test_sweeps_are_placed_as_ever(monkeypatch):
         for row in range(count):
             knot = [moving[name][row - count] for name in ("coarse", "place", "velocity", "quaternion")]
             placed.append(np.concatenate([*knot, [given.shapes.arrays()["scale"][row]]]).tolist())
-        return SimpleNamespace(seconds={})
+        return SimpleNamespace(seconds=0.0)
 
     monkeypatch.setattr(launch.WhiskerSolver, "launch", record)
     monkeypatch.setattr(sweeps, "join_batches", list)
