@@ -364,9 +364,9 @@ def _simulate(
     fidelity = given[0].fidelity
 
     def launch(tries: Sequence[Try]) -> list[LaunchResult]:
-        parts = [np.arange(len(given)) if which is None else np.flatnonzero(which[:, 0]) for which, *_ in tries]
+        parts = [np.arange(len(given)) if which is None else np.flatnonzero(which[:, 0]) for which, _ in tries]
         rows, counts = np.concatenate(parts), [len(part) for part in parts]
-        finer = np.repeat([divisor for _, divisor, *_ in tries], counts)
+        finer = np.repeat([divisor for _, divisor in tries], counts)
         started = time.thread_time()
         packed = PackedTasks.of([given[row] for row in rows], finer)
         # Compiling is done once; it is no cost of a whisker.

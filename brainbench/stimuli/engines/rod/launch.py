@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -228,8 +228,6 @@ class LaunchResult:
     """[row, reading, 6] force and moment of all contacts (N, N·m), when shapes were asked for."""
     seconds: float = 0.0
     """Elapsed time of the kernels."""
-    readings: NDArray[np.float64] | None = None
-    parted: NDArray[np.float64] | None = None
 
     @property
     def steps(self) -> NDArray[np.int32]:
@@ -243,8 +241,7 @@ class LaunchResult:
 
     def picked(self, which: NDArray[np.bool_ | np.integer]) -> LaunchResult:
         """Return some rows of these results, by mask or in an order; their steps count for the first who asks."""
-        tables = {name: values for name, values in vars(self).items() if isinstance(values, np.ndarray)}
-        arrays = {name: values[which] for name, values in tables.items() if name != "readings"}
+        arrays = {name: values[which] for name, values in vars(self).items() if isinstance(values, np.ndarray)}
         counts = {name: values[which] for name, values in self.counts.items()}
         verdict = Verdict(**{name: values[which] for name, values in vars(self.verdict).items()})
         self.counts["steps"][which] = 0
@@ -276,14 +273,6 @@ class LaunchResult:
         change[which] = np.where(half.verdict.unstable, np.nan, changes)[:, 0]
         self.verdict = halved(self.verdict, change, which)
         self.counts["steps"][which] += half.steps[:, 0]
-        mine, theirs = self.wrench[row, :, column, :3].astype(float), half.wrench[:, :, 0, :3].astype(float)
-        square = np.nan_to_num(((mine - theirs) ** 2).sum(axis=2), nan=0.0, posinf=0, neginf=0).cumsum(axis=1)
-        first = (square <= 0.01 * square[:, -1:]).sum(axis=1).clip(0, square.shape[1] - 1)
-        if self.parted is None:
-            self.parted = np.full(which.shape, -np.inf)
-        # the finer run may have failed
-        ok = ~half.verdict.unstable[:, 0]
-        self.parted[which] = np.where(ok, self.readings[np.maximum(first - 1, 0)], half.verdict.until[:, 0])
         return self
 
 
@@ -397,7 +386,6 @@ class WhiskerSolver:
             third=np.partition(force, -3, axis=1)[:, -3] if len(given.readings) >= FEWEST_READINGS else peak,
         )
         result = LaunchResult(wrench, values["contact"], counts, depth, missed, judge(facts), table(jobs.finer))
-        result.readings = given.readings
         result.displacement, result.seconds = values.get("displacement"), seconds
         if given.record_shape:
             result.points = np.moveaxis(values["points"].astype(float) / MILLI, 2, 0)
@@ -511,16 +499,8 @@ def _first_beyond(
     return np.take_along_axis(strength, first[:, None], axis=1)[:, 0], at
 
 
-BEFORE = 0.03
-
-
-class Try(NamedTuple):
-    """Whiskers to simulate, all when None, and what divides their steps: since when (s, [row, column]), and before."""
-
-    which: NDArray[np.bool_] | None = None
-    finer: int = 1
-    since: NDArray[np.float64] | None = None
-    before: int = 1
+Try = tuple[NDArray[np.bool_] | None, int]
+"""Whiskers to simulate, all when None, and what divides their steps."""
 
 
 def run_with_retries(simulate: Callable[[Sequence[Try]], Sequence[LaunchResult]], retry: int) -> LaunchResult:
@@ -534,7 +514,7 @@ def run_with_retries(simulate: Callable[[Sequence[Try]], Sequence[LaunchResult]]
             order, and alone.
         retry: 1 leaves all whiskers as they are.
     """
-    (result,) = simulate([Try()])
+    (result,) = simulate([(None, 1)])
     if retry == 1:
         return result
     simulated: dict[int, list[tuple[NDArray[np.bool_], LaunchResult]]] = {}
@@ -545,9 +525,9 @@ def run_with_retries(simulate: Callable[[Sequence[Try]], Sequence[LaunchResult]]
         for finer, which in wanted.items():
             missing = which & ~np.any([some for some, _ in simulated.setdefault(finer, [])], axis=0)
             if missing.any():
-                tries.append(Try(missing, finer, np.where(since == np.inf, -np.inf, since), max(1, finer // retry)))
-        for each, part in zip(tries, simulate(tries) if tries else (), strict=True):
-            simulated[each.finer].append((each.which, part))
+                tries.append((missing, finer))
+        for (which, finer), part in zip(tries, simulate(tries) if tries else (), strict=True):
+            simulated[finer].append((which, part))
 
     def parts(which: NDArray[np.bool_], finer: int) -> Iterator[tuple[NDArray[np.bool_], LaunchResult]]:
         """Yield these whiskers in parts with their results."""
@@ -557,24 +537,12 @@ def run_with_retries(simulate: Callable[[Sequence[Try]], Sequence[LaunchResult]]
                 yield some, part.picked(some[mask])
 
     left = np.ones_like(result.verdict.retryable)
-    since = np.full(left.shape, np.inf)
-
-    def trouble() -> None:
-        until = result.verdict.until
-        at = np.where(np.isfinite(until), until, -np.inf if result.parted is None else result.parted)
-        now = result.verdict.retryable
-        since[now] = np.minimum(since, at - BEFORE)[now]
-
-    trouble()
     for finer in (1, retry, 2 * retry):
         if finer > 1:
             left = result.verdict.retryable.copy()
-            trouble()
             run({finer: left})
             for some, part in parts(left, finer):
                 result = result.replaced(some, part)
-            result.parted = None
-            trouble()
         suspicious = result.verdict.suspicious & left
         doubtful = suspicious | result.verdict.retryable
         if not doubtful.any():

@@ -334,9 +334,6 @@ class PackedJobs:
     """[job] point forces; none for any when empty."""
     limits: Sequence[NDArray[np.float64] | None] = ()
     """[job] longest step (s) from each cell of the motions on; None for any, for all when empty."""
-    since: NDArray[np.float64] | None = None
-    """[job] time (s) since which ``finer`` divides the steps; before, ``before`` does."""
-    before: NDArray[np.integer] | None = None
 
     def __len__(self) -> int:
         return len(self.whisker)
@@ -352,17 +349,9 @@ class PackedJobs:
         some = zip(self.limits, self.finer, strict=True) if self.limits else ()
         limits = [np.zeros(0) if limit is None else limit * MILLI / finer for limit, finer in some]
         limits = limits or [np.zeros(0)] * len(self)
-        longest = step / self.finer
-        if self.since is not None:
-            cells = np.floor((self.since - start) / 1e-3)
-            longest = np.where(cells > 0, step / self.before, longest)
-            for n in np.flatnonzero(cells > 0):
-                k = int(cells[n])
-                assert not len(limits[n])
-                limits[n] = np.concatenate([np.full(k, step[n] / self.before[n]), [step[n] / self.finer[n]]])
         return {
             **{name: getattr(self, name) for name in ("whisker", "scene", "base", "row", "column")},
-            "step": longest,
+            "step": step / self.finer,
             "limit_first": np.cumsum([0, *map(len, limits)], dtype=np.int32),
             "limit": np.concatenate(limits),
             "load_first": np.cumsum([0, *counts], dtype=np.int32),

@@ -131,23 +131,14 @@ class SweepLauncher:
         count, whiskers = len(shapes.first) - 1, len(bases)
         speed = np.array([sweep.speed for _, sweeps in objects for sweep in sweeps])
         if tries:
-            sweep, whisker = np.concatenate([each.which.nonzero() for each in tries], axis=1, dtype=np.int32)
-            counts = [each.which.sum() for each in tries]
-            finer = np.repeat([each.finer for each in tries], counts)
-            before = np.repeat([each.before for each in tries], counts)
-            since = np.concatenate(
-                [
-                    np.broadcast_to(-np.inf if each.since is None else each.since, each.which.shape)[each.which]
-                    for each in tries
-                ]
-            )
+            sweep, whisker = np.concatenate([which.nonzero() for which, _ in tries], axis=1, dtype=np.int32)
+            finer = np.repeat([divisor for _, divisor in tries], [which.sum() for which, _ in tries])
             row, column = np.arange(len(sweep), dtype=np.int32), np.zeros_like(sweep)
             size = len(sweep), 1
         else:
             # Neighbouring threads take the same whisker past the same object.
             whisker, sweep = np.indices((whiskers, count), dtype=np.int32).reshape(2, -1)
             row, column, finer, size = sweep, whisker, np.ones_like(sweep), (count, whiskers)
-            since = before = None
         radii = np.array([chain.whisker.base_radius for chain in solver.chains])
         speeds = speed[sweep]
         way, farthest = followed(speeds, speeds, solver.steps[whisker] / MILLI, radii[whisker])
@@ -155,7 +146,7 @@ class SweepLauncher:
         approach = Approach(*(np.empty(size, dtype=values.dtype) for values in numbers))
         for whole, values in zip(vars(approach).values(), numbers, strict=True):
             whole[row, column] = values
-        jobs = PackedJobs(whisker, sweep, bases[whisker], row, column, finer, since=since, before=before)
+        jobs = PackedJobs(whisker, sweep, bases[whisker], row, column, finer)
         readings = self.grid.frames.readings
         return solver.launch(Launch(jobs, motions, shapes, readings, size, axes=self._head, approach=approach))
 
@@ -190,9 +181,9 @@ class SweepLauncher:
         """
 
         def launch(tries: Sequence[Try]) -> list[LaunchResult]:
-            some = [each for each in tries if each.which is not None]
+            some = [(which, finer) for which, finer in tries if which is not None]
             result = self.launch(objects, some)
-            return result.split([int(each.which.sum()) for each in some] or [len(result.wrench)])
+            return result.split([int(which.sum()) for which, _ in some] or [len(result.wrench)])
 
         result = run_with_retries(launch, retry)
         if estimated is None:
@@ -220,8 +211,8 @@ class SweepLauncher:
             def launch(divisors: NDArray[np.integer]) -> LaunchResult:
                 whole = np.zeros_like(result.divisor)
                 whole[which] = divisors
-                tries = [Try(whole == divisor, int(divisor)) for divisor in np.unique(divisors[divisors > 0])]
-                order = np.argsort(np.concatenate([np.flatnonzero(each.which) for each in tries]))
+                tries = [(whole == divisor, int(divisor)) for divisor in np.unique(divisors[divisors > 0])]
+                order = np.argsort(np.concatenate([np.flatnonzero(mask) for mask, _ in tries]))
                 return self.launch(objects, tries, solver).picked(order)
 
             divisors = result.divisor[which]

@@ -24,7 +24,6 @@ class _Runs:
     def __init__(self, fates, finer):
         found = [fate[finer] for fate in fates]
         self.state, self.force = (np.array(values, dtype=int) for values in (zip(*found, strict=True)))
-        self.parted = None
         self.finer, self.steps = np.full(len(fates), finer), np.full(len(fates), 100 * finer)
         bad = self.state >= MENDABLE
         words = np.where(bad, f"bad at {finer}", "").astype(object)
@@ -81,8 +80,8 @@ def test_whiskers_are_simulated_as_often_as_the_rule_says(retry, fates):
     launches = []
 
     def simulate(tries):
-        launches.append([finer for _, finer, *_ in tries])
-        masks = [(np.ones(len(fates), dtype=bool) if which is None else which, finer) for which, finer, *_ in tries]
+        launches.append([finer for _, finer in tries])
+        masks = [(np.ones(len(fates), dtype=bool) if which is None else which, finer) for which, finer in tries]
         seen.update((whisker, finer) for which, finer in masks for whisker in np.flatnonzero(which))
         return [
             _Runs([fate for fate, chosen in zip(fates, which, strict=True) if chosen], finer) for which, finer in masks
