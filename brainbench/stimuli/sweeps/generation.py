@@ -7,6 +7,7 @@ import math
 import multiprocessing
 import os
 import shutil
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -52,16 +53,19 @@ from brainbench.stimuli.sweeps.plan import (
     ShardTask,
     build_object,
     make_shard,
+    simulate_shard,
     warm_up,
+    write_shard,
 )
 
 Done = Callable[[int], None]  # called with the number of sweeps of a shard that is written
 
-SIDE_BY_SIDE = 32
-"""Most shards that are made on one GPU at the same time. Whiskers that are simulated again are few and take many steps
-one after the other, however idle the GPU is, which meanwhile simulates those of other shards for the first time."""
+SIDE_BY_SIDE = 16
+"""Most shards that are simulated on one GPU at the same time. Whiskers that are simulated again are few and take many
+steps one after the other, however idle the GPU is, which meanwhile computes those of other shards."""
 WHISKER_BYTES = 10_000, 32
 """Room on a GPU for a whisker of a sweep, and for each of its frames more: state, contacts and results."""
+WRITERS = 4  # shards behind a GPU that may be hashed and written meanwhile: one thread hashes about 1 GB/s
 AHEAD = 4
 """Shards at least whose objects are built ahead of the simulation; more if a process would have nothing to do."""
 STARTING = 8  # objects that take about as long to build as a process to start
@@ -152,9 +156,18 @@ def _run_share(gpu: str, pipe: connection.Connection, tasks: Sequence[ShardTask]
 def run_pipelined(tasks: Sequence[ShardTask], folder: Path, workers: int, done: Done) -> None:
     """Make shards in threads of this process, some at the same time, while other processes build objects.
 
-    The objects of some shards ahead (:data:`AHEAD`) and the forces of :data:`SIDE_BY_SIDE` shards are in memory.
+    The objects of some shards ahead (:data:`AHEAD`) and the forces of at most :data:`SIDE_BY_SIDE` + :data:`WRITERS`
+    shards are in memory.
     """
-    most = min(_shards_at_once(tasks[0]), len(tasks))
+    at_once = _shards_at_once(tasks[0])
+    free = threading.Semaphore(at_once)
+
+    def make(task: ShardTask, objects: Sequence[BuiltObject]) -> int:
+        with free:
+            content = simulate_shard(task, objects, workers)
+        return write_shard(content, folder)
+
+    most = min(at_once + WRITERS, len(tasks))
     making: set[Future[int]] = set()
     processes = min(workers, max(len(tasks), sum(len(task.objects) for task in tasks) // STARTING))
     try:
@@ -163,7 +176,7 @@ def run_pipelined(tasks: Sequence[ShardTask], folder: Path, workers: int, done: 
                 # Fails where the first shard will fail, which tells of it.
                 threads.submit(warm_up, tasks[0])
                 for task, objects in _built_ahead(tasks, builders, processes):
-                    making.add(threads.submit(make_shard, task, str(folder), workers, objects))
+                    making.add(threads.submit(make, task, objects))
                     del objects
                     if len(making) == most:
                         ended, making = wait(making, return_when=FIRST_COMPLETED)

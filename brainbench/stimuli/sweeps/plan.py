@@ -126,9 +126,9 @@ class BuiltObject:
     """Result of :meth:`WhiskerEngine.pack`; None when the engine takes no sweeps."""
 
 
-def make_shard(task: ShardTask, folder: str, workers: int | None = None, objects: Sequence[BuiltObject] = ()) -> int:
-    """Simulate and write one shard past its objects, which are built unless they are given; return its sweeps."""
-    return write_shard(simulate_shard(task, objects, workers), folder)
+def make_shard(task: ShardTask, folder: str, workers: int | None = None) -> int:
+    """Build, simulate and write one shard with ``workers`` threads; return the number of its sweeps."""
+    return write_shard(simulate_shard(task, workers=workers), folder)
 
 
 def build_object(source: NamedObject, settings: GenerationSettings, grid: SweepGrid) -> BuiltObject:

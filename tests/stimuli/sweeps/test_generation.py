@@ -104,7 +104,7 @@ def test_a_process_of_a_gpu_that_dies_is_told(tmp_path, monkeypatch):
 
 def test_a_shard_that_fails_ends_the_others_and_is_told(plan, tmp_path, monkeypatch):
     monkeypatch.setattr(generation, "worker_pool", _threads)
-    monkeypatch.setattr(generation, "make_shard", _refuse)
+    monkeypatch.setattr(generation, "write_shard", _refuse)
     told = []
     monkeypatch.setattr(generation, "stop_pool", lambda pool: told.append(generation.STOPPING.is_set()))
     with pytest.raises(DataError, match="disk"):
@@ -113,7 +113,7 @@ def test_a_shard_that_fails_ends_the_others_and_is_told(plan, tmp_path, monkeypa
     assert not generation.STOPPING.is_set()
 
 
-def _refuse(*_):
+def _refuse(content, folder):
     raise DataError("the disk is full")
 
 

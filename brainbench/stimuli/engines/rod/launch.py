@@ -454,8 +454,7 @@ class WhiskerSolver:
                 # Whiskers that are simulated again go first: others wait for them.
                 urgent = bool((jobs.finer > 1).all())
                 slices = Slices(self.kernels, self.capacity, count, device, urgent=urgent, **self.tuning)
-            with slices.turn:
-                self.slices = slices.run(scene, problems, results, self.block["block_dim"])
+            self.slices = slices.run(scene, problems, results, self.block["block_dim"])
             return slices.stream
         with lock_of(device):
             inputs = [*scene, problems, self.kernels.structs.PausedWhiskers(), results]

@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 from collections.abc import Mapping
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,9 +33,6 @@ POLL = 4e-4  # time (s) between two looks at whether a GPU is done
 LONG = 10_000  # looks after which the GPU is asked with Warp's own call, which tells of a failure
 PIECE = 2**21  # numbers that are copied to the host under one hold of the lock: some 2 ms
 
-TURNS, MANY = threading.Semaphore(3), 4096
-"""Launches side by side that have more whiskers left than that: they fill a GPU."""
-
 _LOCK = threading.RLock()
 _OWN = threading.local()
 
@@ -43,11 +40,6 @@ _OWN = threading.local()
 def lock_of(device: Any) -> AbstractContextManager[Any]:
     """Return what a thread holds while it calls Warp for a device; threads on a processor need not wait."""
     return _LOCK if device.is_cuda else nullcontext()
-
-
-def turn_of(device: Any, left: int) -> AbstractContextManager[Any]:
-    """Return what a thread holds while it has many whiskers left; threads on a processor need not wait."""
-    return TURNS if device.is_cuda and left > MANY else nullcontext()
 
 
 def streams_of(device: Any, side: int, priority: int) -> tuple[Any, list[Any], list[tuple[Any, Any]]]:
@@ -161,14 +153,11 @@ class Slices:
         size = np.zeros(3, dtype=np.int32)
         size[AFTER_OTHERS] = lanes
         on.queue, on.queue_size = (wp.array(values, device=device) for values in (queue, size))
-        self.turn = ExitStack()
-        """What the caller of :meth:`run` holds."""
 
     def run(self, scene: SceneParts, problems: Any, results: Any, block: int) -> int:
         """Take all whiskers to their end with ``block`` threads of a block; return the number of slices."""
         wp, waits, slices, left = warp(), 0, 0, self.lanes
         inputs = scene, problems, results
-        self.turn.enter_context(turn_of(self.device, left))
         graphs: list[Any] = []
         fits = 0
         while left:
@@ -204,8 +193,6 @@ class Slices:
                 event, count = self.counts[(waits - 1 - AHEAD) % len(self.counts)]
                 wait_for(event)
                 left = int(count.numpy().sum())
-            if left <= MANY:
-                self.turn.close()
         if graphs:
             # Those that were launched after the last whisker had ended.
             wait_for(self.counts[(waits - 1) % len(self.counts)][0])

@@ -91,33 +91,6 @@ def test_threads_that_take_turns_on_a_gpu_get_what_one_alone_gets(as_a_gpu):
             np.testing.assert_array_equal(together[name].counts[field], values)
 
 
-def test_launches_take_turns_while_many_whiskers_are_left(as_a_gpu, monkeypatch):
-    gpu, processor = SimpleNamespace(is_cuda=True), SimpleNamespace(is_cuda=False)
-    assert slices.turn_of(gpu, slices.MANY + 1) is slices.TURNS
-    assert slices.TURNS not in {slices.turn_of(gpu, slices.MANY), slices.turn_of(processor, slices.MANY + 1)}
-    seen = []
-
-    class Turn:
-        def __enter__(self):
-            seen.append("begins")
-
-        def __exit__(self, *failure):
-            seen.append("ends")
-
-    wait_for = slices.wait_for
-    monkeypatch.setattr(slices, "wait_for", lambda event: wait_for(event) or seen.append("waits"))
-    monkeypatch.setattr(slices, "turn_of", lambda device, left: Turn())
-    monkeypatch.setattr(slices, "MANY", 20)
-    objects = resolve_objects(["brick-0"], surfaces=True)
-    scenes = SweepScenes(GRID, {name: item.load for name, item in objects.items()})
-    _launch(scenes, "brick-0", recorded=True)
-    # The next may begin before the last whiskers have come to their end.
-    assert seen[0] == "begins"
-    assert seen.count("ends") == 1
-    assert "waits" in seen[: seen.index("ends")]
-    assert "waits" in seen[seen.index("ends") :]
-
-
 def test_sweeps_are_placed_as_ever(monkeypatch):
     objects = resolve_objects(["brick-0", "torus-0"], surfaces=True)
     scenes = SweepScenes(GRIDS["thesis-high"], {name: item.load for name, item in objects.items()}, whiskers="C1,C2")
