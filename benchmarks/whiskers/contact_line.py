@@ -1,9 +1,9 @@
 """Whiskers whose contacts touch the bent rod, beside the same on straight links, in scenes no table was measured on.
 
-``python -m benchmarks.whiskers.contact_line [--seeds 11,12] [--write]``
+``python -m benchmarks.whiskers.contact_line [--seeds 11,12] [--meshes] [--write]``
 
 The truth has 50 links, 20 µs, contact forces solved to 1e-6, and contacts on the rod; whiskers for which straight links
-differ from it by more than 5 % there do not converge and are left out, counted.
+differ from it by more than 5 % there do not converge and are left out, counted. With ``--meshes`` objects are surfaces.
 """
 
 from __future__ import annotations
@@ -16,21 +16,27 @@ from benchmarks.report import publish, script_parser, table
 from brainbench.core.statistics import wilson_interval
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
-from tests.factories.contact_scenes import FLAT_OBJECTS, HARD_OBJECTS, contact_jobs, difference
+from tests.factories.contact_scenes import FLAT_OBJECTS, HARD_OBJECTS, contact_jobs, difference, meshed
 
 TRUTH = "accurate,links=50,time_step=2e-5,steps_per_period=400,contact_tolerance=1e-6"
 LINES = "links", "rod"
 KINDS = ("post", "ball", "edge", *FLAT_OBJECTS, *HARD_OBJECTS)
+MESHES = ("post", "ball", "edge", "hollow", *FLAT_OBJECTS, *HARD_OBJECTS, "procedural")
 
 
 def main() -> None:
     parser = script_parser(__doc__)
     parser.add_argument("--seeds", default="11,12")
-    parser.add_argument("--kinds", default=",".join(KINDS))
+    parser.add_argument("--meshes", action="store_true")
+    parser.add_argument("--kinds")
     options = parser.parse_args()
     engine, rows = get_engine("rod"), []
-    for kind in options.kinds.split(","):
-        jobs = [job for seed in options.seeds.split(",") for job in contact_jobs(int(seed), each=1, objects=(kind,))]
+    kinds = options.kinds.split(",") if options.kinds else MESHES if options.meshes else KINDS
+    for kind in kinds:
+        drawn = ("ball" if kind == "procedural" else kind,)
+        jobs = [job for seed in options.seeds.split(",") for job in contact_jobs(int(seed), each=1, objects=drawn)]
+        if options.meshes:
+            jobs = meshed(jobs, kind)
         truth, straight = (
             engine.run(jobs, Fidelity.parse(f"{TRUTH},contact_line={line}")) for line in ("rod", "links")
         )
@@ -51,7 +57,8 @@ def main() -> None:
             rows.append([kind, f"`{preset}`", f"{len(errors[0])}", *quantiles, share, f"{spent[1] / spent[0]:.2f}"])
         print(rows[-3:], f"{len(jobs) - sum(sound)} left out", flush=True)
     head = ["objects", "preset", "whiskers", "straight links: median, 90 %", "bent rod", "nearer [95 %]", "time"]
-    publish(options, "Contacts on the bent rod, in random scenes", table(head, rows), f"--seeds {options.seeds}")
+    title = "Contacts of meshes on the bent rod" if options.meshes else "Contacts on the bent rod, in random scenes"
+    publish(options, title, table(head, rows), f"--seeds {options.seeds}" + " --meshes" * options.meshes)
 
 
 if __name__ == "__main__":

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.rotations import base_rotation, euler_matrix
+from brainbench.core.rotations import base_rotation, euler_matrix, to_matrices
 from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.motion.trajectories import ArrayFollicle, Whisking, smooth_step
-from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle, Part
+from brainbench.stimuli.objects.collections import resolve_objects
+from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Obstacle, Part, Sphere
 from brainbench.stimuli.objects.solid import Solid, box, capsule, rodgers_solid, sphere
 from brainbench.stimuli.validation.bench_tests import sliding
 from brainbench.stimuli.whiskers.array import SPECIES, MountedWhisker, WhiskerArray
@@ -29,6 +30,7 @@ with its tip, and one that is pulled away from it."""
 FRICTIONS = (0.0, 0.4, 0.8)
 FREQUENCIES = (5.0, 10.0, 20.0)  # whisks per second [Hz]
 _RETRACTION = math.radians(12)
+_SIDES = 32  # of a post of triangles
 _PULL = 0.01
 """Time in which an object of the kind ``release`` is pulled away [s]."""
 
@@ -55,6 +57,28 @@ def contact_jobs(
         for species, kind, friction, frequency in cells
     ]
     return [jobs[index] for index in random.permutation(len(jobs))]
+
+
+def meshed(jobs: list[Job], kind: str) -> list[Job]:
+    """Return jobs whose objects are surfaces: posts of 32 sides and balls of 320 triangles, with corners on the round
+    ones, boxes of 12; of ``procedural``, shapes of the size of their balls, one after another."""
+    solids = itertools.cycle([item.load() for item in resolve_objects(["procedural-24:1"], surfaces=True).values()])
+    changed = []
+    for job in jobs:
+        obstacle = job.obstacles[0]
+        if kind == "procedural":
+            ball = obstacle.parts[0]
+            assert isinstance(ball, Sphere)
+            solid = next(solids).to_diagonal(2 * np.sqrt(3) * ball.radius)
+            assert solid.surface is not None
+            middle = solid.surface.bounds.mean(axis=0)
+            obstacle = replace(obstacle, surface=solid.surface.transformed(np.eye(3), np.subtract(ball.centre, middle)))
+        elif obstacle.surface is None:
+            obstacle = replace(
+                obstacle, parts=tuple(ConvexPart(np.array([*_corners(part)])) for part in obstacle.parts)
+            )
+        changed.append(replace(job, obstacles=(obstacle,)))
+    return changed
 
 
 def difference(trace: Trace, reference: Trace) -> float:
@@ -172,3 +196,23 @@ def _faces() -> NDArray[np.float64]:
     mesh = rodgers_solid().mesh
     assert mesh is not None
     return mesh.vertices.reshape(-1, 4, 3)
+
+
+def _corners(part: Part) -> Iterator[NDArray[np.float64]]:
+    """Return the corners of the polyhedron that stands for a part."""
+    from trimesh import creation
+
+    if isinstance(part, Sphere):
+        yield from np.asarray(part.centre) + part.radius * creation.icosphere(subdivisions=2).vertices
+    elif isinstance(part, Capsule):
+        along = np.subtract(part.end, part.start)
+        along /= np.linalg.norm(along)
+        across = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
+        across /= np.linalg.norm(across)
+        turns = np.arange(_SIDES)[:, None] * 2 * np.pi / _SIDES
+        ring = part.radius * (np.cos(turns) * across + np.sin(turns) * np.cross(along, across))
+        yield from np.concatenate([part.start + ring, part.end + ring])
+    else:
+        assert isinstance(part, Box)
+        signs = np.array(list(itertools.product((-1, 1), repeat=3)))
+        yield from np.asarray(part.centre) + (signs * part.half_sizes) @ to_matrices(part.quaternion).T

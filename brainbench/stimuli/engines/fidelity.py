@@ -17,12 +17,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from brainbench.core.errors import UsageError, brief, check_name, check_number
 from brainbench.core.limits import Limit, Positive, limited, read_pairs, read_value, with_changes
 from brainbench.core.tradeoffs import TradeoffPoint, cheapest
-from brainbench.stimuli.objects.obstacle import Box, Capsule, Cylinder, Obstacle, Sphere
 from brainbench.stimuli.whiskers.whisker import Chain, Whisker, build_chain
 
 if TYPE_CHECKING:
     from brainbench.stimuli.motion.jobs import Job
-    from brainbench.stimuli.objects.solid import Solid
 
 logger = logging.getLogger(__name__)
 
@@ -59,8 +57,8 @@ class Fidelity:
     contact_line: Literal["links", "rod"] | None = field(default=None, metadata={"later": True})
     """What contacts touch: the straight links, whose direction jumps at each joint, or the centre line of the bent rod,
     as beam theory tells it between the joints: with the same links many times nearer where a whisker is held between
-    contacts or slides past one. The backend ``rod`` alone knows it, for objects of spheres, capsules, cylinders and
-    boxes. None: the rod where nothing else is in reach of a whisker, the links where a mesh is."""
+    contacts or slides past one. The backend ``rod`` alone knows it. None: the rod where the
+    backend can, but the links in sweeps past objects that move, many of which meet a whisker head-on."""
     contact_tolerance: Annotated[float, Limit(least=1e-12, most=1e-3)] | None = field(
         default=None, metadata={"later": True}
     )
@@ -122,13 +120,11 @@ class Fidelity:
         """Return this fidelity with ``twist`` where it leaves that open."""
         return replace(self, twist=twist) if self.twist is None else self
 
-    def touching(self, bodies: Iterable[Obstacle | Solid]) -> Fidelity:
+    def touching(self, bodies: Iterable[object]) -> Fidelity:
         """Return this fidelity with what contacts with the bodies of a scene touch, where it leaves that open."""
         if self.contact_line is not None:
             return self
-        parts = [part for body in bodies for part in (body.surface, *body.parts) if part is not None]
-        primitive = bool(parts) and all(isinstance(part, Sphere | Capsule | Cylinder | Box) for part in parts)
-        return replace(self, contact_line="rod" if primitive else "links")
+        return replace(self, contact_line="rod" if any(True for _ in bodies) else "links")
 
     def chain(self, whisker: Whisker) -> Chain:
         """Return the chain of links that stands for a whisker; errors as for :meth:`link_count`."""

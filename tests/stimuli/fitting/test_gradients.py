@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -174,9 +175,10 @@ def _quasistatic() -> Fidelity:
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.4])
+@pytest.mark.parametrize("line", ["rod", pytest.param("links", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", ["post", pytest.param("mesh", marks=pytest.mark.slow)])
-def test_contact_has_the_gradients_of_central_differences(kind, friction):
-    _check_contact(kind, friction)
+def test_contact_has_the_gradients_of_central_differences(kind, line, friction):
+    _check_contact(kind, friction, line)
 
 
 @pytest.mark.slow
@@ -186,10 +188,10 @@ def test_contact_with_every_feature_has_the_gradients_of_central_differences(kin
     _check_contact(kind, friction)
 
 
-def _check_contact(kind: str, friction: float) -> None:
+def _check_contact(kind: str, friction: float, line: Literal["links", "rod"] = "rod") -> None:
     names = (*MATERIAL, *BASE[:4], *OBJECT, *(("friction",) if friction else ()))
     # A long difference may meet another contact, a short one is rounding: one of the two is right.
-    job, line = touching_job(SOLIDS[kind], friction=friction), {"mesh": "links"}.get(kind, "rod")
+    job = touching_job(SOLIDS[kind], friction=friction)
     (errors, run), (shorter, _) = (
         gradient_errors(job, names, fidelity=replace(COARSE, contact_line=line), change=change)
         for change in (1e-4, 1e-5)

@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import to_struct, warp
-from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod.limits import (
     CONTACT_BOUNDS,
@@ -315,11 +314,6 @@ class WhiskerSolver:
         self.yields = any(chain.whisker.follicle is not None for chain in self.chains)
         rolls = any(chain.rest_rolls.any() for chain in self.chains)
         self.smooth = smooth = fidelity.contact_line == "rod" and (needs > NOTHING or device.is_cpu)
-        if smooth and needs == MESHES:
-            raise UsageError(
-                "contact_line=rod knows spheres, capsules, cylinders and boxes, but no meshes; leave it out, or build "
-                "the objects of these."
-            )
         uses = {"yields": self.yields, "rolls": rolls, "flows": flows, "smooth": smooth}
         features = tuple(name for name, used in uses.items() if used)
         self.kernels = load_kernels(

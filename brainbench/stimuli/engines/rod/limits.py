@@ -58,6 +58,12 @@ ANYWHERE = 1e6
 """The same (mm) for a link that may have got inside unseen: the nearest triangle tells inside from outside."""
 PARTS = 8
 """Parts of a link at whose ends its overlap with a surface is measured."""
+DEPTH_HALVINGS = 12
+"""Halvings by which the deepest place between two of these is found."""
+TRIANGLES_TRIED = 9
+"""Times that a triangle is sought that is nearer to the centre line of a link, where the last is nearest or beside."""
+ASIDE = 1 / 32
+"""How far beside, as a share of the link: at an edge of the face with which a line is flush no triangle is nearer."""
 BITS = 3
 WIDE = 1 << BITS
 """Children of a node of a search tree, and triangles of a leaf."""
@@ -76,8 +82,9 @@ STALE = 0.5
 """Way (mm) after which they are listed again, once one of them may be within reach of a contact."""
 WIDEST = 0.8
 """Widest search for contacts (mm)."""
-CREVICE = 0.02
-"""Overlap (mm) that one step may undo; deeper ones are undone over several steps, without a blow."""
+CREVICE = 0.02, 0.06
+"""Overlap (mm) that one step may undo, of straight links and of the bent rod, whose soft tip moves beside its links;
+deeper ones are undone over several steps, without a blow."""
 
 
 def contacts_for(capacity: int) -> int:

@@ -12,8 +12,8 @@ from brainbench.stimuli.engines.rod.limits import ANYWHERE, CAPSULE, CYLINDER, M
 from ..algebra import rotate, unrotate, vec3, vec4, vec6
 from ..articulated_body import ChainState
 from ..distances import triangle_corners, triangle_feature
+from ..mesh_search import nearest_triangles
 from ..motion import BodyMotion, pose_from
-from ..narrow_phase import nearest_triangles
 from ..parameters import real, smooth
 from ..state import (
     Cone,
@@ -110,22 +110,28 @@ def primitive_curvature(kind: int, size: vec3, x: vec3, normal: vec3) -> Princip
 
 @wp.func
 def mesh_curvature(
-    shapes: ShapeArrays, s: int, a: vec3, b: vec3, share: real, normal: vec3, distance: real
+    shapes: ShapeArrays, s: int, a: vec3, b: vec3, share: real, x: vec3, normal: vec3, distance: real
 ) -> PrincipalCurvature:
-    """Return the curvatures of the distance from a mesh at a point of the link a–b, by the feature found for it.
+    """Return the curvatures of the distance from a mesh at a point x beside the link a–b, by the feature found for it.
 
-    Between the ends of a link that is an edge or a corner, as ``narrow_phase`` looks for it; elsewhere what is nearest.
+    Between the ends of a straight link that is an edge or a corner, as ``narrow_phase`` looks for it; elsewhere, and
+    beside the bent rod, what is nearest.
     """
     found = PrincipalCurvature()
     found.direction = any_tangent(normal)
+    between = share < real(1.0)
     start = a
-    if share == real(1.0):
-        start = b
-    got = nearest_triangles(shapes, s, start, b, real(wp.static(ANYWHERE)), real(1.01) * wp.abs(distance), -1, 0, 1)
+    stop = b
+    if wp.static(smooth):
+        between = False
+        stop = x
+    if not between:
+        start = stop
+    got = nearest_triangles(shapes, s, start, stop, real(wp.static(ANYWHERE)), real(1.01) * wp.abs(distance), -1, 0, 1)
     which = got.end_face
     v = got.end_v
     w = got.end_w
-    if share < real(1.0):
+    if between:
         which = got.face
         v = got.v
         w = got.w
@@ -133,7 +139,7 @@ def mesh_curvature(
         face = shapes.face[s] + which
         feature = triangle_feature(v, w)
         # On an edge between coplanar faces the surface is flat.
-        flat = share == real(1.0) and wp.abs(wp.dot(normal, shapes.outward[face, 0])) > real(0.99999)
+        flat = not between and wp.abs(wp.dot(normal, shapes.outward[face, 0])) > real(0.99999)
         if feature > 0 and not flat:
             rows = triangle_corners(shapes.corners, face)
             found.second = real(1.0) / distance
@@ -160,13 +166,13 @@ def curvature_at(
     local_quaternion = shapes.quaternion[s]
     scale = shapes.scale[s]
     n = unrotate(local_quaternion, unrotate(body.quaternion, normal))
+    local = unrotate(local_quaternion, unrotate(body.quaternion, x - body.place) - shapes.place[s]) / scale
     found = PrincipalCurvature()
     if shapes.kind[s] == wp.static(MESH):
         a = unrotate(local_quaternion, unrotate(body.quaternion, start - body.place) - shapes.place[s]) / scale
         b = unrotate(local_quaternion, unrotate(body.quaternion, stop - body.place) - shapes.place[s]) / scale
-        found = mesh_curvature(shapes, s, a, b, share, n, distance / scale)
+        found = mesh_curvature(shapes, s, a, b, share, local, n, distance / scale)
     else:
-        local = unrotate(local_quaternion, unrotate(body.quaternion, x - body.place) - shapes.place[s]) / scale
         found = primitive_curvature(shapes.kind[s], shapes.size[s] / scale, local, n)
     k1 = found.first / scale
     k2 = found.second / scale

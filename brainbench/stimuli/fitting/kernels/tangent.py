@@ -275,7 +275,7 @@ def move_contact(
     share_d = zero
     if s < real(1.0) and curved > real(1e-9) * wp.length_sq(link):
         slope = wp.dot(n, tangent_d) + wp.dot(n_d, tangent)
-        if shapes.kind[shape] != wp.static(MESH):
+        if wp.static(smooth) or shapes.kind[shape] != wp.static(MESH):
             slope = slope - (end_d - start_d)
         share_d = -slope / curved
     n_d = n_d + bent * share_d
@@ -305,11 +305,11 @@ def move_contact(
         v_d = v_d - onward * slide_d - (tangent_d - onward * wp.dot(onward, tangent_d)) * (slide / size)
 
     closing_d = zero
-    if -contact.gap < real(wp.static(CREVICE)):
+    if -contact.gap < real(wp.static(CREVICE[smooth])):
         closing_d = -gap_d / h
     found.condition = velocity_block(contacts, k) * v_d - n * closing_d
     if contact_row(contacts.slides, k) == 0:
-        closing = wp.min(-contact.gap, real(wp.static(CREVICE))) / h
+        closing = wp.min(-contact.gap, real(wp.static(CREVICE[smooth]))) / h
         found.condition = found.condition - n_d * closing
         return found
     friction_d = tangents.shape_friction[p, shape]

@@ -11,7 +11,7 @@ from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
-from tests.factories.contact_scenes import HARD_OBJECTS, contact_jobs, difference
+from tests.factories.contact_scenes import HARD_OBJECTS, contact_jobs, difference, meshed
 from tests.factories.gradients import touching_job
 from tests.factories.pressed_whiskers import held_job, sliding_job
 from tests.factories.rod_chain import in_double
@@ -96,9 +96,9 @@ def test_a_plane_of_bending_is_like_any_other():
     np.testing.assert_allclose(_held("balanced", about_x=0.9), upright, atol=2e-3 * 0.09)
 
 
-def _slide(fidelity):
+def _slide(fidelity, job=None):
     """Ripple of Fx, peak to peak, under a post that slides along the pressed whisker at constant depth."""
-    trace = get_engine("rod").run([sliding_job()], Fidelity.parse(fidelity), workers=1)[0]
+    trace = get_engine("rod").run([job or sliding_job()], Fidelity.parse(fidelity), workers=1)[0]
     # The last readings stand apart: the post stops.
     force, t = trace.wrench[90:450, 0], np.linspace(-1, 1, 360)
     return np.ptp(force - np.polyval(np.polyfit(t, force, 6), t)) / np.abs(force).mean()
@@ -121,12 +121,40 @@ def test_slip_reverses_when_that_of_many_links_does():
     assert difference(straight, fine) > 0.03
 
 
-def test_meshes_and_other_backends_take_straight_links():
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 1e-4
-    with pytest.raises(UsageError, match=r"contact_line=rod knows spheres, .* but no meshes"):
-        _held("balanced,contact_line=rod", shape=ConvexPart(corners))
+def test_other_backends_take_straight_links():
     with pytest.raises(UsageError, match="'mujoco' touch with straight links; leave contact_line out"):
         _held("balanced,contact_line=rod", backend="mujoco")
+
+
+def _prism(corners, radius=1e-4):
+    angles = np.arange(corners) * 2 * np.pi / corners
+    return ConvexPart(np.array([[radius * np.cos(a), radius * np.sin(a), z] for z in (-4e-3, 4e-3) for a in angles]))
+
+
+@pytest.mark.parametrize(("preset", "most"), [("fast", 0.02), ("balanced", 0.006), ("accurate", 0.002)])
+def test_posts_of_triangles_press_as_round_ones(preset, most):
+    mesh = _prism(32)
+    assert _miss(preset, shape=mesh) < most < 0.06 < _miss(f"{preset},contact_line=links", shape=mesh)
+
+
+def test_a_sliding_post_of_triangles_makes_no_sawtooth():
+    """Edges pass the joints: what slides past one there comes no nearer to it."""
+    job = sliding_job()
+    (post,) = job.obstacles
+    job = dataclasses.replace(job, obstacles=(dataclasses.replace(post, parts=(_prism(32, radius=3e-4),)),))
+    assert _slide("balanced", job) < 0.005 < 0.06 < _slide("balanced,contact_line=links", job)
+
+
+@pytest.mark.parametrize("kind", ["edge", "slot"])
+def test_boxes_of_triangles_press_as_boxes_do(kind):
+    """In single precision whiskers that lie flush are sensitive to everything."""
+    jobs = contact_jobs(11, each=1, objects=(kind,))[:6]
+    fidelity = Fidelity.parse("balanced,precision=double")
+    boxes, meshes = (get_engine("rod").run(some, fidelity, workers=1) for some in (jobs, meshed(jobs, kind)))
+    assert [trace.status for trace in meshes] == [trace.status for trace in boxes]
+    gaps = [difference(mesh, box) for mesh, box in zip(meshes, boxes, strict=True) if box.status == "ok"]
+    assert len(gaps) >= 5
+    assert max(gaps) < 2e-3
 
 
 def test_a_contact_at_a_joint_is_on_the_link_behind_it_however_its_arc_is_rounded():

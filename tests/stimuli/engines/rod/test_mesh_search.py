@@ -59,7 +59,7 @@ def test_every_aligned_run_of_triangles_is_a_box_that_holds_them():
 def _ask(surface, starts, stops, radius, within, leaf):
     """Squared distances [segment, 3] of the kernel's search from the segments, their ends and their starts."""
     wp.init()
-    search = specialize("narrow_phase", real=wp.float64)
+    search = specialize("mesh_search", real=wp.float64)
     nearest_triangles, ShapeArrays = search.nearest_triangles, search.ShapeArrays
     filled = to_struct(ShapeArrays, _shapes(surface), "cpu")
 
@@ -214,7 +214,7 @@ def test_a_link_outside_is_never_told_that_it_overlaps_wherever_the_search_begin
 
 def _measure_leaves(arrays, starts, stops, threads):
     """Numbers [thread, segment, 7] that the threads of a group find in the leaf of each segment's rank."""
-    nodes = specialize("narrow_phase", real=wp.float64, group_size=threads)
+    nodes = specialize("mesh_search", real=wp.float64, group_size=threads)
     measure_triangles, NearestTriangles = nodes.measure_triangles, nodes.NearestTriangles
     SearchSegment, SearchBounds, LeafCorners = nodes.SearchSegment, nodes.SearchBounds, nodes.LeafCorners
     own = WIDE // threads
@@ -290,7 +290,7 @@ def test_threads_that_search_together_find_what_one_finds(lanes):
     alone = np.where((alone == alone.min(axis=1, keepdims=True)) | counts, alone, np.nan)
     arrays = _shapes(surface)
     with thread_warp() as (threads, load):
-        nearest = load("narrow_phase", group_size=lanes).nearest_triangles
+        nearest = load("mesh_search", group_size=lanes).nearest_triangles
         bodies = SimpleNamespace(**{name: Memory(values) for name, values in arrays.items()})
         for begin in range(0, len(starts), count):
             found = {}

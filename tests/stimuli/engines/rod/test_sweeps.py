@@ -1,5 +1,7 @@
 """Many sweeps in one launch: what they give is what their scenes give, whatever comes together."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -22,7 +24,7 @@ def test_sweeps_through_the_fast_path_equal_their_scenes():
     objects = resolve_objects(["ellipsoid-1"], surfaces=True)
     grid = SweepGrid(speed=(0.05,), rotation=(0.0, 0.7), distance=(0.005,), size=(0.03,))
     scenes = SweepScenes(grid, {name: item.load for name, item in objects.items()}, whiskers="C1,C2,D2")
-    fidelity = Fidelity(links=10, time_step=5e-4)
+    fidelity = Fidelity(links=10, time_step=5e-4, contact_line="links")
     fast = simulate_sweeps(scenes, [0, 1], fidelity=fidelity)
     slow = simulate([scenes[0], scenes[1]], fidelity=fidelity, backend="rod", cache=False)
     assert not fast.unstable.any()
@@ -173,13 +175,14 @@ def test_a_force_that_no_whisker_bears_is_flagged_in_sweeps_and_not_tried_again(
 
 
 @pytest.mark.slow
-def test_whiskers_that_pause_for_every_look_at_a_mesh_feel_the_same():
+@pytest.mark.parametrize("line", ["links", "rod"])
+def test_whiskers_that_pause_for_every_look_at_a_mesh_feel_the_same(line):
     objects = resolve_objects(["torus-1", "gear-0"], surfaces=True)
     grid = SweepGrid(speed=(0.06,), rotation=(0.0, 0.4), distance=(0.005,), size=(0.04,))
     scenes = SweepScenes(grid, {name: item.load for name, item in objects.items()})
     results = []
     for sliced in (False, True):
-        launcher = SweepLauncher(scenes, COARSE, sliced=sliced)
+        launcher = SweepLauncher(scenes, replace(COARSE, contact_line=line), sliced=sliced)
         results.append(launcher.launch([(name, grid.sweeps(name)) for name in scenes.objects]))
         assert (launcher.solver.slices > 1) == sliced
     whole, parts = results

@@ -1,10 +1,10 @@
 """Warp kernels of the whisker solver. Units: mg, mm, ms, mN, µN·m.
 
 ``step`` runs whiskers from reading to reading. In each step ``articulated_body`` finds the motion of the chain and its
-accelerations without contact, ``broad_phase`` and ``narrow_phase`` (with ``distances``) where it may touch something,
-``contact_solver`` and ``delassus`` the contact forces. Whiskers at rest are skipped; on a GPU whiskers pause
-while kernels of ``narrow_phase`` and ``contact_solver`` find the distances and forces that they wait for. Steps may be
-written down by the kernels of another package, the recorder.
+accelerations without contact, ``broad_phase`` and ``narrow_phase`` (with ``mesh_search`` and ``distances``) where it
+may touch something, ``contact_solver`` and ``delassus`` the contact forces. Whiskers at rest are skipped; on a GPU
+whiskers pause while kernels of ``narrow_phase`` and ``contact_solver`` find the distances and forces that they wait
+for. Steps may be written down by the kernels of another package, the recorder.
 
 The modules are ordinary Warp code for the types and sizes in ``parameters``. :func:`specialize` loads them once for
 each precision and size, like a template.

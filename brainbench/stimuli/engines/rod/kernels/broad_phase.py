@@ -26,6 +26,7 @@ from brainbench.stimuli.engines.rod.limits import (
     LARGEST_OVERLAP,
     LARGEST_START_OVERLAP,
     LISTED,
+    MESH,
     NOTHING,
     STALE,
     STARTED_INSIDE,
@@ -46,6 +47,7 @@ from .state import (
     WAIT_FORCES,
     WAIT_REST,
     WAIT_SLICE,
+    CentreLine,
     ContactCandidates,
     ContactProblems,
     LinkDistance,
@@ -219,6 +221,7 @@ def list_shapes(scene: SceneArrays, job: WhiskerJob, chain: wp.ref[ChainState], 
 @wp.func(inline=True)
 def query_distances(
     scene: SceneArrays,
+    problems: ContactProblems,
     paused: PausedWhiskers,
     job: WhiskerJob,
     chain: wp.ref[ChainState],
@@ -233,12 +236,19 @@ def query_distances(
     if state.first_query + near_count > paused.query.shape[0]:
         return WAIT_SLICE
     place = state.first_query
+    base = rotate(step.pose.quaternion, vec3(real(1.0), real(0.0), real(0.0)))
+    rod = RodPlace()
     for i in range(job.links):
+        if wp.static(smooth):
+            enter_link(scene.chains, problems, job, chain, state.contacts, i, rod)
         if may_be_near(scene, job, proximity, reach, i):
             paused.query[place].job = job.index
             paused.query[place].link = i
             paused.query[place].start = row(chain.node, i)
             paused.query[place].stop = row(chain.node, i + 1)
+            if wp.static(smooth):
+                bent = bent_link(scene.chains, problems, job, chain, base, state.contacts, i, rod)
+                paused.query[place].line = bent.line
             nearer = reach.time * (row(proximity.end_speed, i) + reach.unknown_speed)
             paused.query[place].bound = row(proximity.clearance, i) - nearer
             place = place + 1
@@ -348,8 +358,7 @@ def find_candidates(
             others = near.room - near.moved
     shorter = real(0.0)
     end_slide = real(0.0)
-    if wp.static(smooth):
-        rod = RodPlace()
+    rod = RodPlace()
     for i in range(job.links):
         rate = row(chain.rate, i)
         joint = row(chain.node, i)
@@ -425,7 +434,13 @@ def find_candidates(
                         middle = instant(now.tick, now.part + real(0.5) * h)
                         half = pose_from(scene.motions, scene.shapes.track[s], middle, pose)
                         object_velocity = half.velocity + wp.cross(half.spin, point - half.place)
-                        approach = wp.dot(normal, linear + wp.cross(angular, point) - object_velocity)
+                        heading = normal
+                        # What slides along the rod past a joint comes no nearer to it.
+                        if wp.static(smooth) and which == 1 and i < job.links - 1:
+                            if scene.shapes.kind[s] == wp.static(MESH):
+                                onward = wp.normalize(line_tangent(link_here, share))
+                                heading = normal - onward * wp.dot(onward, normal)
+                        approach = wp.dot(heading, linear + wp.cross(angular, point) - object_velocity)
                         # Where the gap will be: tells apart what only passes by.
                         ahead = gap + real(1.5) * h * wp.min(approach, zero)
                         if gap + real(1.5) * job.longest_step * wp.min(approach, zero) <= real(wp.static(CLOSED)):
@@ -623,6 +638,8 @@ def check_rest(
                     paused.query[place].link = i
                     paused.query[place].start = at
                     paused.query[place].stop = end_at
+                    if wp.static(smooth):
+                        paused.query[place].line = CentreLine()
                     paused.query[place].bound = bound
                 else:
                     slack = real(1e30)

@@ -136,7 +136,7 @@ def add_contact(problems: ContactProblems, solver: wp.ref[SolverState], own: wp.
     own.friction[k] = candidate.friction
     own.point[k] = candidate.point
     # A deep overlap is undone over several steps.
-    own.closing_rate[k] = wp.min(-candidate.gap, real(wp.static(CREVICE))) / solver.step
+    own.closing_rate[k] = wp.min(-candidate.gap, real(wp.static(CREVICE[smooth]))) / solver.step
     own.axis[3 * k] = normal
     own.axis[3 * k + 1] = tangent
     own.axis[3 * k + 2] = wp.cross(normal, tangent)

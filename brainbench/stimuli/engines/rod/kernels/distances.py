@@ -14,11 +14,12 @@ import warp as wp
 from brainbench.stimuli.engines.rod.limits import CAPSULE, CYLINDER, SPHERE, WIDE
 
 from .algebra import mat33, vec2, vec3, vec4, vec5
-from .parameters import real
+from .parameters import real, smooth
 from .state import Cone, LeafCorners, ShapeArrays, line_place, line_tangent
 
 # As fine as the numbers: 2⁻²⁰ is about 1e-6, 2⁻⁴⁴ about 6e-14 of a link.
 halvings = 20 if real is wp.float32 else 44
+least_slope = 2e-7 if real is wp.float32 else 1e-14
 tiny = 1e-12 if real is wp.float32 else 1e-24
 
 
@@ -150,6 +151,14 @@ const auto segments = [&](const real* a, const real* d1, const real* p, const re
 )
 """Closest points of two segments."""
 
+AREAS = "const real vc = d1 * d4 - d3 * d2, vb = d5 * d2 - d1 * d6, va = d3 * d6 - d5 * d4;"
+if smooth:
+    # The same without products of four lengths, whose rounding moves a place on a slender triangle by a radius.
+    AREAS = """real normal[3], part[3];
+    cross(pq, pr, normal);
+    cross(qx, rx, part); const real va = dot(normal, part);
+    cross(rx, px, part); const real vb = dot(normal, part);
+    cross(px, qx, part); const real vc = dot(normal, part);"""
 TRIANGLES = (
     SEGMENTS
     + f"""
@@ -160,8 +169,9 @@ const auto point_triangle = [&](const real* x, const real* p, const real* q, con
         pq[d] = q[d] - p[d]; pr[d] = r[d] - p[d]; px[d] = x[d] - p[d]; qx[d] = x[d] - q[d]; rx[d] = x[d] - r[d];
     }}
     const real d1 = dot(pq, px), d2 = dot(pr, px), d3 = dot(pq, qx), d4 = dot(pr, qx), d5 = dot(pq, rx);
-    const real d6 = dot(pr, rx), vc = d1 * d4 - d3 * d2, vb = d5 * d2 - d1 * d6, va = d3 * d6 - d5 * d4;
-    const real whole = va + vb + vc, share = (d4 - d3) / (d4 - d3 + d5 - d6);
+    const real d6 = dot(pr, rx), share = (d4 - d3) / (d4 - d3 + d5 - d6);
+    {AREAS}
+    const real whole = va + vb + vc;
     // Voronoi regions of the face, then from the last to the first of p, q, pq, r, pr, qr: the first counts.
     v = vb / whole; w = vc / whole;
     const bool at_qr = (va <= zero) & (d4 - d3 >= zero) & (d5 - d6 >= zero);
@@ -295,3 +305,81 @@ def way_out(shapes: ShapeArrays, face: int, v: real, w: real, x: vec3, distance:
         side = -side
         signed = -distance
     return vec4(away[0] * side, away[1] * side, away[2] * side, signed)
+
+
+@wp.func_native(TRIANGLES + "wp::vec_t<2, real> at; point_triangle(x.c, p.c, q.c, r.c, at.c[0], at.c[1]); return at;")
+def triangle_place(x: vec3, p: vec3, q: vec3, r: vec3) -> vec2:
+    """Return barycentric v and w of q and r of the point of a triangle that is closest to x."""
+    ...
+
+
+@wp.func
+def beside_triangle(shapes: ShapeArrays, face: int, x: vec3, normal: vec3) -> int:
+    """Return −1 where a point, ``normal`` away from a triangle, is inside, and 1 where none beside it may be nearer.
+
+    0: the point is over the face beyond an edge, as nearly as rounding tells, and its line flush with that face.
+    """
+    rows = triangle_corners(shapes.corners, face)
+    at = triangle_place(x, rows[0], rows[1], rows[2])
+    outward = pseudo_normal(shapes, face, at[0], at[1])
+    over = wp.dot(outward, normal)
+    if over < real(0.0):
+        return -1
+    return int(over >= wp.dot(outward, shapes.outward[face, 0]) - real(1e-6))
+
+
+@wp.func
+def line_triangle(shapes: ShapeArrays, face: int, link: Cone) -> vec5:
+    """Return the place along a link's centre line (0 to 1) of the least gap to a triangle, that gap and the direction.
+
+    Where the slope of the gap is zero, by false position: a slope that stays twice counts half (Dowell & Jarratt 1971).
+    Triangles have no inside: a point beyond an edge may lie below their plane.
+    """
+    rows = triangle_corners(shapes.corners, face)
+    ra = link.start_radius
+    rb = link.end_radius
+    precise = real(wp.static(least_slope)) * wp.length(link.b - link.a)
+    low = real(0.0)
+    high = real(1.0)
+    below = real(0.0)
+    above = real(0.0)
+    # The far end, then the near one: a minimum at an end is put exactly there, because contacts at ends are handled
+    # apart.
+    share = high
+    away = vec3()
+    far = real(0.0)
+    side = int(0)
+    turns = int(0)
+    while turns < wp.static(2 * halvings):
+        if turns == 1:
+            share = low
+        elif turns > 1:
+            share = low + (high - low) * below / (below - above)
+        x = line_place(link, share)
+        at = triangle_place(x, rows[0], rows[1], rows[2])
+        away = x - rows[0] - (rows[1] - rows[0]) * at[0] - (rows[2] - rows[0]) * at[1]
+        far = wp.max(wp.length(away), real(tiny))
+        away = away / far
+        slope = wp.dot(away, line_tangent(link, share)) - (rb - ra)
+        if slope > real(0.0):
+            if turns == 1:
+                break
+            if side == 1:
+                below = real(0.5) * below
+            high = share
+            above = slope
+            side = 1
+        else:
+            if turns == 0:
+                break
+            if side == -1:
+                above = real(0.5) * above
+            low = share
+            below = slope
+            side = -1
+        if turns > 1 and (wp.abs(slope) <= precise or high - low <= real(wp.static(2.0**-halvings))):
+            break
+        if turns == 1:
+            side = 0
+        turns = turns + 1
+    return vec5(share, far - (ra + (rb - ra) * share), away[0], away[1], away[2])

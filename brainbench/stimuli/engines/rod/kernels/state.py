@@ -411,6 +411,8 @@ class LinkDistance:
     """Lower bound of the distance of the link's axis from the surface."""
     leaf: wp.int32
     """Leaf of the search tree (+ 1) where the nearest triangle is; 0 without."""
+    if smooth:
+        face: wp.int32
 
 
 @wp.struct
@@ -562,6 +564,8 @@ class DistanceQuery:
     stop: vec3
     bound: real
     """Lower bound of its distance, as far as that is known; 0 or less: it may be inside."""
+    if smooth:
+        line: CentreLine
 
 
 @wp.struct

@@ -288,7 +288,9 @@ def run(
                     if wp.static(stage == 1):
                         wait = WAIT_DISTANCES
                         if near_count > 0:
-                            wait = query_distances(scene, paused, job, chain, proximity, state, reach, step, near_count)
+                            wait = query_distances(
+                                scene, problems, paused, job, chain, proximity, state, reach, step, near_count
+                            )
                         state.top_speed = previous_speed
                         break
                     lower_clearance(job, proximity, near, reach)
