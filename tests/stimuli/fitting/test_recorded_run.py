@@ -55,9 +55,10 @@ def test_beyond_its_room_memory_grows_with_the_square_root_of_the_steps(monkeypa
 
 
 def test_forces_of_several_contacts_with_friction_are_solved_to_rounding():
-    # Sweeps alone leave a seventh of the contact steps of this whisker on a mesh unsolved.
+    # Sweeps alone leave a seventh of the contact steps of this whisker on a mesh unsolved. On the bent rod some of its
+    # steps are degenerate.
     job = contact_jobs(11, each=1)[31]
-    solver, result = _record(job, replace(FINE, links=11))
+    solver, result = _record(job, replace(FINE, links=11, contact_line="links"))
     summary = _forward(solver)["contacts"][0]
     assert result.steps[0, 0] > 2000
     assert summary["slipped"] > 5
