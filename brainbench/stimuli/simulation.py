@@ -301,9 +301,14 @@ def _to_world(scene: Scene, traces: Sequence[Trace]) -> NDArray[np.float32]:
 
 
 def config_hash(scenes: Sequence[Scene], fidelity: Fidelity, backend: str) -> str:
-    """Return a hash of what was asked for, equal on every machine whatever its arithmetic."""
+    """Return a hash of what was asked for and of the physics, equal on every machine whatever its arithmetic.
+
+    Scores and synthetic animals have it for their stimuli, so they are others where the physics are.
+    """
     arrays = [scene.mounts for scene in scenes]
-    return content_hash(backend, fidelity, portable([scene.config() for scene in scenes]), portable(arrays))
+    # Forces that keep a promise depend on how their errors are estimated.
+    physics = PHYSICS_VERSION if fidelity.error is None else (PHYSICS_VERSION, RULE)
+    return content_hash(backend, fidelity, physics, portable([scene.config() for scene in scenes]), portable(arrays))
 
 
 def cache_path(
@@ -317,9 +322,7 @@ def cache_path(
     from importlib import metadata
 
     library = metadata.version(engine.package) + engine.revision if engine.package else ""
-    # Forces that keep a promise depend on how their errors are estimated.
-    versions = PHYSICS_VERSION if fidelity.error is None else (PHYSICS_VERSION, RULE)
-    key = content_hash(config_hash(scenes, fidelity, engine.name), library, versions, *more, length=24)
+    key = content_hash(config_hash(scenes, fidelity, engine.name), library, *more, length=24)
     return cache_dir(folder) / f"{key}.h5"
 
 

@@ -188,10 +188,12 @@ def test_whatever_changes_the_result_changes_the_place_in_the_cache(engine, chan
 
 
 def test_another_version_of_the_physics_never_takes_these_results_for_its_own(engine, monkeypatch):
-    _simulate(_scene(), "fake")
+    before = _simulate(_scene(), "fake")
     monkeypatch.setattr(simulation, "PHYSICS_VERSION", PHYSICS_VERSION + 1)
-    _simulate(_scene(), "fake")
+    after = _simulate(_scene(), "fake")
     assert len(engine.jobs) == 6
+    # Scores and the demo's animals know their stimuli by it.
+    assert before.attrs["config_hash"] != after.attrs["config_hash"]
 
 
 def test_an_edited_drawing_module_leaves_simulations_in_their_place_in_the_cache(tmp_path):
