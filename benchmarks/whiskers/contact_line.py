@@ -21,22 +21,18 @@ from tests.factories.contact_scenes import FLAT_OBJECTS, HARD_OBJECTS, contact_j
 TRUTH = "accurate,links=50,time_step=2e-5,steps_per_period=400,contact_tolerance=1e-6"
 LINES = "links", "rod"
 KINDS = ("post", "ball", "edge", *FLAT_OBJECTS, *HARD_OBJECTS)
-MESHES = ("post", "ball", "edge", "hollow", *FLAT_OBJECTS, *HARD_OBJECTS, "procedural")
 
 
 def main() -> None:
     parser = script_parser(__doc__)
     parser.add_argument("--seeds", default="11,12")
     parser.add_argument("--meshes", action="store_true")
-    parser.add_argument("--kinds")
     options = parser.parse_args()
     engine, rows = get_engine("rod"), []
-    kinds = options.kinds.split(",") if options.kinds else MESHES if options.meshes else KINDS
-    for kind in kinds:
+    for kind in (*KINDS, "hollow", "procedural") if options.meshes else KINDS:
         drawn = ("ball" if kind == "procedural" else kind,)
         jobs = [job for seed in options.seeds.split(",") for job in contact_jobs(int(seed), each=1, objects=drawn)]
-        if options.meshes:
-            jobs = meshed(jobs, kind)
+        jobs = meshed(jobs, kind) if options.meshes else jobs
         truth, straight = (
             engine.run(jobs, Fidelity.parse(f"{TRUTH},contact_line={line}")) for line in ("rod", "links")
         )
