@@ -20,7 +20,7 @@ MOST_MODULES = 16
 MOST_LINES = 700
 """Lines of a module, which is cut by idea; 150 to 450 are usual."""
 BUDGETS = {
-    "brainbench/stimuli": 27_610,  # the error of every whisker, follicles that give way, air, shapes in space, species,
+    "brainbench/stimuli": 27_620,  # the error of every whisker, follicles that give way, air, shapes in space, species,
     # rest shapes that links cannot follow, contacts of meshes too on the bent rod, and their derivatives for fits
     "robotics_bridge": 25_230,  # newtons that no taxel has, trees of any hand, replays, gel pictures, devices fitted,
     # a status for each fitted device, the side of a thin solid that contact reports, shadows that say they are apart,
@@ -42,7 +42,7 @@ BUDGETS = {
 }
 """Folder → lines of Python that it may have: as the rooms stand, with two per cent to move in. Who adds a capability
 pays in the same folder, or raises the number in the commit that needs it, with the reason."""
-MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 97_870, 394
+MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 97_880, 394
 """Lines grew last by responses of any kind, errors of sweeps, boards of 10,000 records, ONNX files tried apart, drift
 over time, files of torch_brain and rsatoolbox both ways, real tactile devices fitted jointly to presses, air flow,
 rest shapes in space, species files, stimuli of single trials and contacts on the bent rod."""

@@ -79,7 +79,8 @@ def traces_at(run: GradientRun, values: NDArray[np.float64]) -> list[Trace]:
         assert task is not None
         knots = knots_alike(near.base, job.follicle.pose, base_rotation, span, "the base of a whisker")
         base, chain = replace(near.base, knots=knots), build_chain(job.whisker, near.chain.links)
-        tasks.append(replace(task, chain=chain, base=base, limit=near.limit, twists=near.twists))
+        like = {"limit": near.limit, "twists": near.twists, "fidelity": near.fidelity}
+        tasks.append(replace(task, chain=chain, base=base, **like))
         steps.append(group.solver.steps[group.packed.jobs.whisker[row]])
     return run._launch(tasks, steps)[0]
 
