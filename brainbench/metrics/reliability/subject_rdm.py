@@ -288,8 +288,8 @@ def _shared(sessions: list[SortedTrials], count: int, comparison: str, index: In
         crossed = every.crossed([quarters(each, index, seed, shift) for each in sessions])
         # Pairs of four in order: the first goes with the last.
         shared = shared + products(crossed[:3], crossed[:2:-1], comparison).mean(axis=0) / SHIFTS
-    whole = every.whole()
-    return shared / products(whole, whole, comparison)
+    total = products(every.whole(), every.whole(), comparison)
+    return np.divide(shared, total, out=np.full(np.shape(shared), np.nan), where=total > 0)
 
 
 def _signal(first: Floats, second: Floats, whole: Floats, method: str, comparison: str) -> Floats:

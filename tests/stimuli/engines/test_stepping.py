@@ -54,11 +54,11 @@ def test_a_thin_rod_that_soft_contacts_throw_back_carries_its_error_and_rod_foll
 
 def test_whiskers_at_ordinary_speeds_err_little():
     # Whisks at 5 to 20 Hz onto posts, balls, edges and hollows, without friction; two err by 22 % and more beside rod,
-    # and touches that begin or end at other readings count more than they err in a third.
+    # and touches that begin or end at other readings, or half a step later, count more than they err in a third.
     jobs = [job for job in contact_jobs(3, each=1) if job.obstacles[0].friction == 0.0]
     traces = ESTIMATED.run(jobs, Fidelity.preset("fast"), workers=2)
     assert sum(trace.status == "ok" for trace in traces) >= 22
-    assert np.median([trace.error for trace in traces if trace.status == "ok"]) < 0.06
+    assert np.median([trace.error for trace in traces if trace.status == "ok"]) < 0.07
     assert sum(trace.error > 0.2 for trace in traces) == 3
 
 
