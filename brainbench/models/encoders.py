@@ -52,7 +52,8 @@ def zhuang_graph(
     meaning.
     """
     scaled = small_width if small else int
-    memory = None if feedforward else Memory(cell, layer_norm=layer_norm)
+    # A memory checks its own kind.
+    memory = None if feedforward else Memory(cell, layer_norm=layer_norm)  # pyright: ignore[reportArgumentType]
     names = [f"conv{index}" for index in range(1, 7)]
     nodes = [
         Node(name, Convolution(scaled(width), padding="valid" if name == "conv1" else "same"), memory)
