@@ -234,14 +234,16 @@ def split_members(session: SortedTrials, index: Ints | None, seed: int) -> Float
 SHIFTS = 4  # ways in which trials in order are divided into quarters, each a sixteenth further on than the last
 
 
-def quarters(session: SortedTrials, index: Ints | None, seed: int, shift: int) -> Ints:
-    """Return the quarter 0 to 3 of its stimulus that each trial [S, R] is in; of fewer than four some are empty."""
+def quarters(session: SortedTrials, index: Ints | None, seed: int) -> Ints:
+    """Return the quarter 0 to 3 of its stimulus each trial [shift, S, R] is in; of fewer than four some are empty."""
     random = _numbers(session, index, seed)
-    result, sizes = np.empty(random.shape, dtype=np.int64), np.bincount(session.labels)
+    sizes = np.bincount(session.labels)
     places, number = np.arange(len(session.labels)) - np.repeat(np.cumsum(sizes) - sizes, sizes), sizes[session.labels]
     order = np.lexsort((random, np.broadcast_to(session.labels, random.shape)))
-    quarter = (4 * SHIFTS * places + shift * number) // (SHIFTS * number) % 4
-    np.put_along_axis(result, order, quarter[None], axis=-1)
+    result = np.empty((SHIFTS, *random.shape), dtype=np.int64)
+    for shift in range(SHIFTS):
+        quarter = (4 * SHIFTS * places + shift * number) // (SHIFTS * number) % 4
+        np.put_along_axis(result[shift], order, quarter[None], axis=-1)
     return result
 
 

@@ -284,11 +284,12 @@ def _shared(sessions: list[SortedTrials], count: int, comparison: str, index: In
     """
     comparison = comparison if comparison in LINEAR else "pearson"
     every, shared = SplitRDMs(sessions, count, "sqeuclidean"), 0.0
-    for shift in range(SHIFTS):
-        crossed = every.crossed([quarters(each, index, seed, shift) for each in sessions])
+    for parts in zip(*(quarters(each, index, seed) for each in sessions), strict=True):
+        crossed = every.crossed(list(parts))
         # Pairs of four in order: the first goes with the last.
         shared = shared + products(crossed[:3], crossed[:2:-1], comparison).mean(axis=0) / SHIFTS
-    total = products(every.whole(), every.whole(), comparison)
+    whole = every.whole()
+    total = products(whole, whole, comparison)
     return np.divide(shared, total, out=np.full(np.shape(shared), np.nan), where=total > 0)
 
 

@@ -271,7 +271,7 @@ def link_shape_distance(
                             looked = 0
                             away = vec3(tried[2], tried[3], tried[4])
                             side = beside_triangle(shapes, face, line_place(link, tried[0]), away)
-                            # Rounding would measured the way from a face that the line pierces.
+                            # Rounding would decide the way out of a face that the line pierces.
                             if off < real(0.03) * rb:
                                 side = int(-1)
                     if looked == 3 or (looked > 0 and side != 0) or measured > wp.static(TRIANGLES_TRIED):
