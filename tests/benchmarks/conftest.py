@@ -6,25 +6,15 @@ from pathlib import Path
 
 import pytest
 
-from brainbench.benchmarks.opening import Benchmark, make
-from brainbench.core.files import write_text
-from brainbench.scoring.options import ScoreOptions
-from tests.factories.scored_files import write_study
+from brainbench.benchmarks.opening import Benchmark, open_benchmark
+from tests.factories.scored_files import write_laboratory
 
 
 @pytest.fixture(scope="session")
 def laboratory(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Benchmark]:
     """A folder with ``lab.toml`` and what it names, made once; copy it to change it."""
     folder = tmp_path_factory.mktemp("laboratory")
-    write_study(folder)
-    options = ScoreOptions(
-        recordings=str(folder / "data"), conditions="trials:texture", stimuli=str(folder / "eight.h5"), seed=1
-    )
-    benchmark = make(
-        options, folder / "lab.toml", name="lab", citation="Doe J., A Journal 1:2 (2026), doi:10.1000/xyz", doi="10.1/2"
-    )
-    write_text(folder / "lab.toml", benchmark.to_toml())
-    return folder, benchmark
+    return folder, open_benchmark(write_laboratory(folder))[0]
 
 
 @pytest.fixture

@@ -1,8 +1,10 @@
-"""Seeded damage to files: bytes, texts, HDF5 trees, archives of arrays and weights, and what is no file."""
+"""Seeded damage to values and files: nested data, bytes, texts, HDF5 trees, archives, weights, and what is no file."""
 
 from __future__ import annotations
 
+import copy
 import json
+import math
 import os
 import random
 import re
@@ -27,6 +29,14 @@ _VALUE = re.compile(rb'"[^"\n]*"|-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?|true|false|nul
 _NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 _XML = (".xml", ".urdf")
 TEXTS = (".json", ".toml", ".csv", ".txt", ".obj", ".off", ".xml", ".urdf", ".yaml", ".key")
+ODD: tuple[Any, ...] = (
+    math.nan, math.inf, -math.inf, 1e308, -1e308, 1e-320, 2**31, -(2**31), 2**63, -1, 0, 0.5, True, None, "", " ",
+    "nan", "x" * 5000, [], {}, [[]], {"a": {}}, [None], [math.nan] * 3, "../../etc/passwd", "os:system", "\x00",
+    "\u202e", "\ud800", "1", 10**400, [[0] * 3] * 1000,
+)  # fmt: skip
+"""What takes the place of a value."""
+TWINS = str.maketrans({"a": "а", "e": "е", "o": "о", "i": "і", "x": "х", "p": "р", "c": "с"})
+"""Latin letters and the Cyrillic ones that look like them."""
 _NUMBERS = (np.nan, np.inf, -np.inf, -1.0, 1e300, 0.0, 3.5)
 
 
@@ -276,3 +286,71 @@ def _checkpoint(path: Path, chance: random.Random) -> str:
         state[name] = state[name].to_sparse() if kind == "sparse" else state[name].to("meta")
     torch.save(content, path)
     return f"{kind} {name}"
+
+
+def mutate(value: Any, seed: int) -> Any:
+    """Return a JSON value with one to three places changed, removed, doubled or moved."""
+    chance = random.Random(seed)
+    for _ in range(chance.randint(1, 3)):
+        alter(value, chance)
+    return value
+
+
+def alter(value: Any, chance: random.Random) -> str:
+    """Change one place in a nested value."""
+    places = _places(value)
+    if not places:
+        return "nothing"
+    return change(*chance.choice(places), chance)
+
+
+def change(holder: Any, key: Any, chance: random.Random) -> str:
+    """Change what stands at a key or index of a mapping or list."""
+    kinds = ["odd"] * 5
+    if isinstance(holder, dict):
+        kinds += ["drop", "drop", "rename", "extra"]
+    else:
+        kinds += ["drop", "double", "swap"]
+    if isinstance(holder[key], (int, float)) and not isinstance(holder[key], bool):
+        kinds += ["scale"] * 3 + ["sign", "text"]
+    if isinstance(holder[key], list) and holder[key]:
+        kinds += ["empty", "nest", "repeat", "shorter"]
+    if isinstance(holder[key], str):
+        kinds += ["twin", "upper", "long"]
+    kind, old = chance.choice(kinds), holder[key]
+    if kind == "odd":
+        holder[key] = copy.deepcopy(chance.choice(ODD))
+    elif kind == "drop":
+        del holder[key]
+    elif kind == "rename":
+        holder[chance.choice((key.translate(TWINS), key.upper(), f"{key} ", "__class__"))] = holder.pop(key)
+    elif kind == "extra":
+        holder[chance.choice(("x", "__proto__", "", "é", key + "_"))] = old
+    elif kind == "double" and isinstance(holder, list):
+        holder.append(old)
+    elif kind == "swap":
+        holder[key], holder[0] = holder[0], holder[key]
+    elif kind == "scale":
+        holder[key] = old * 10.0 ** chance.randint(-300, 300) if abs(old) < 1e8 else -old
+    else:
+        changes: dict[str, Callable[[], Any]] = {
+            "sign": lambda: -old,
+            "text": lambda: str(old),
+            "empty": list,
+            "nest": lambda: [old],
+            "repeat": lambda: old * 300,
+            "shorter": lambda: old[:-1],
+            "twin": lambda: old.translate(TWINS),
+            "upper": old.upper if kind == "upper" else str,
+            "long": lambda: old * 999,
+        }
+        holder[key] = changes[kind]()
+    return f"{kind} {str(key)[:20]}"
+
+
+def _places(value: Any) -> list[tuple[Any, Any]]:
+    places: list[tuple[Any, Any]] = []
+    pairs = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, inner in pairs:
+        places += [(value, key), *_places(inner)]
+    return places

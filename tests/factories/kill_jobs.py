@@ -343,7 +343,7 @@ JOBS = (
     KillJob("benchmark make", 8, _make_benchmark, _factory("scored_files", "write_study"), (*_CLI, *_BENCHMARK)),
     KillJob(
         "benchmark pack", 8, _command("benchmark pack {inputs}/lab.toml --out {out}/lab.zip --json"),
-        _factory("foreign_commands", "benchmark"), (*_CLI, *_BENCHMARK),
+        _factory("scored_files", "write_laboratory"), (*_CLI, *_BENCHMARK),
     ),
     KillJob(
         "models import", 12, _command("models import {inputs}/x.ckpt --architecture s4-small --out {out} --json"),

@@ -6,9 +6,11 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from brainbench.benchmarks.opening import make
 from brainbench.datasets import write_recordings
 from brainbench.datasets.sessions import make_session
 from brainbench.models.features import write_features
+from brainbench.scoring.options import ScoreOptions
 
 LABELS = ("a", "b", "c", "d")
 EIGHT = tuple("abcdefgh")
@@ -70,3 +72,14 @@ def write_study(tmp_path: Path) -> dict[str, str]:
     features = write_features(tmp_path / "features.h5", EIGHT, {"fc": rng.normal(size=(len(EIGHT), 6))})
     paths = {"data": "data", "arrays": "eight.h5", "board": "board", "secret": "secret", "out": "out"}
     return {name: str(tmp_path / path) for name, path in paths.items()} | {"features": str(features)}
+
+
+def write_laboratory(folder: Path) -> Path:
+    """Write the same with the benchmark ``lab.toml`` that is made of them."""
+    write_study(folder)
+    options = ScoreOptions(
+        recordings=str(folder / "data"), conditions="trials:texture", stimuli=str(folder / "eight.h5"), seed=1
+    )
+    words = {"name": "lab", "citation": "Doe J., A Journal 1:2 (2026), doi:10.1000/xyz", "doi": "10.1/2"}
+    (folder / "lab.toml").write_text(make(options, folder / "lab.toml", **words).to_toml())
+    return folder / "lab.toml"

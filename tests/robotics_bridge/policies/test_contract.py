@@ -31,10 +31,9 @@ from robotics_bridge.policies.shipped import stored
 from robotics_bridge.tasks.registry import apply_overrides
 from robotics_bridge.tasks.settings import CONTACTS, ContactModel
 from robotics_bridge.tasks.task import TASK_VERSION
-from tests.factories.damage import damaged
+from tests.factories.damage import damaged, mutate
 from tests.factories.hand_gallery import GALLERY
 from tests.factories.policies import contract_of, teacher_in
-from tests.factories.structures import mutate
 
 NAN, INF = math.nan, math.inf
 

@@ -23,9 +23,8 @@ from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.training import distill as training
 from robotics_bridge.policies.training.distill import CONFIG, MODEL, ChunkStep, distill, load_student
 from robotics_bridge.policies.training.distill_config import DistillConfig
-from tests.factories.damage import damaged
+from tests.factories.damage import damaged, mutate
 from tests.factories.policies import student_folder
-from tests.factories.structures import mutate
 from tests.factories.task_worlds import Follower, TouchWorld
 
 

@@ -42,9 +42,8 @@ from robotics_bridge.policies.training.teacher import train as train_teacher
 from robotics_bridge.tasks.goals import SteppingRotation
 from robotics_bridge.tasks.settings import CONTACTS, TeacherSettings
 from robotics_bridge.tasks.task import TASK_VERSION
-from tests.factories.damage import damaged
+from tests.factories.damage import damaged, mutate
 from tests.factories.policies import teacher_in
-from tests.factories.structures import mutate
 from tests.factories.task_worlds import Follower, TouchWorld
 
 SMALL = TeacherSettings(num_envs=4, steps_per_env=6, iterations=4, epochs=2, minibatches=2, hidden=(16, 16))
