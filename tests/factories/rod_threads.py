@@ -9,122 +9,14 @@ from __future__ import annotations
 import re
 import sys
 import threading
+from collections.abc import Callable, Mapping
 from contextlib import contextmanager
 from functools import partial
 from types import FunctionType, ModuleType, SimpleNamespace
 
 import numpy as np
-from scipy.optimize import lsq_linear
 
-from brainbench.geometry.mesh import point_triangle_distance
 from brainbench.stimuli.engines.rod.kernels import specialize
-from brainbench.stimuli.engines.rod.limits import WIDE
-
-NONE_LEFT = 2**31 - 1
-
-
-def _segments_apart(a, b, p, q):
-    """Least squared distance of two segments."""
-    return 2 * lsq_linear(np.stack([b - a, p - q], axis=1), p - a, bounds=(0, 1), method="bvls").cost
-
-
-def _segment_triangle(a, b, corners):
-    """Squared distance of a segment from the edges of a triangle; 0 where it pierces the face."""
-    matrix = np.stack([corners[1] - corners[0], corners[2] - corners[0], a - b], axis=1)
-    if abs(np.linalg.det(matrix)) > 1e-24:
-        v, w, share = np.linalg.solve(matrix, a - corners[0])
-        if min(v, w, share, 1 - share, 1 - v - w) >= 0:
-            return 0.0
-    return min(_segments_apart(a, b, corners[k], corners[k - 1]) for k in range(3))
-
-
-def measure_triangles(children, corners, leaf, first, count, part, line, _bounds, got):
-    own = range(min(children, count - first))
-    triangles = [corners[leaf][:, children * part + k].reshape(3, 3) for k in own]
-    for k, triangle in enumerate(triangles):
-        ends = [float(point_triangle_distance(x[None], triangle[None])[0]) ** 2 for x in (line.b, line.a)]
-        for name, face, square in (
-            ("side", "face", _segment_triangle(line.a, line.b, triangle)),
-            ("end", "end_face", ends[0]),
-            ("start", "start_face", ends[1]),
-        ):
-            if square < getattr(got, name):
-                setattr(got, name, square)
-                setattr(got, face, first + k)
-
-
-def bound_boxes(children, boxes, node, part, line, _bounds, level, side, end):
-    for k in range(children):
-        low, high = boxes[node][:, children * part + k].reshape(2, 3)
-        ends = np.stack([line.a, line.b])
-        gap = np.maximum(np.maximum(low - ends.max(axis=0), ends.min(axis=0) - high), 0)
-        away = np.maximum(np.maximum(low - line.b, line.b - high), 0)
-        side[level, k], end[level, k] = gap @ gap, away @ away
-
-
-def nearest_child(children, side, end, level, part, bounds):
-    code = NONE_LEFT
-    for k in range(children):
-        if side[level, k] < bounds.side or end[level, k] < bounds.end:
-            bits = int(np.float32(side[level, k]).view(np.int32))
-            code = min(code, (bits & -WIDE) + children * part + k)
-    return code
-
-
-def pass_joint(_children, joints, joint, twists, step, _each, unit):
-    j, w, v = joints[joint], unit.w.values, unit.v.values
-
-    def rates(which):
-        motion = getattr(j, f"motion{which}")
-        return motion.w @ w + motion.v @ v
-
-    def pass_on(which, rate):
-        gain = getattr(j, f"gain{which}")
-        w[:] -= np.outer(gain.w, rate)
-        v[:] -= np.outer(gain.v, rate)
-
-    inverse = j.inverse_inertia
-    if twists:
-        unit.joint_rate.values[2] = rates(3)
-        unit.impulse.values[2] = step * inverse[3] * unit.joint_rate.values[2]
-        pass_on(3, unit.joint_rate.values[2])
-    u = unit.joint_rate.values[:2]
-    u[:] = rates(1), rates(2)
-    unit.impulse.values[:2] = step * np.array([inverse[:2], inverse[1:3]]) @ u
-    pass_on(1, u[0])
-    pass_on(2, u[1])
-
-
-def joint_rate(_children, unit, hinge, row):
-    return unit.joint_rate.values[hinge, row]
-
-
-def _columns(matrix, rows, contact):
-    return matrix.values.reshape(-1, rows)[3 * contact : 3 * contact + 3]
-
-
-def add_joint(_children, unit, contact, rate1, rate2, rate3, twists, _first, _each, matrix):
-    impulse = unit.impulse.values
-    columns = _columns(matrix, impulse.shape[1], contact)
-    columns += np.outer(rate1, impulse[0]) + np.outer(rate2, impulse[1])
-    if twists:
-        columns += np.outer(rate3, impulse[2])
-
-
-def clear(_children, matrix, _count, _each):
-    matrix.values[:] = 0
-
-
-def add_rates(_children, own, matrix, contact, force, _each):
-    own.rate.values += force @ _columns(matrix, len(own.rate.values), contact)
-
-
-NATIVES = {
-    function.__name__: function
-    for function in (measure_triangles, bound_boxes, nearest_child, pass_joint, joint_rate, add_joint, clear, add_rates)
-}
-"""By the name of the kernels' function; the first argument is the number of children that one thread looks at."""
-
 
 WARP = 32
 
@@ -134,9 +26,7 @@ class Memory(np.lib.mixins.NDArrayOperatorsMixin):
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: object, **options: object) -> object:
         """Calculate with the values."""
-        return getattr(ufunc, method)(
-            *(part.values if isinstance(part, Memory) else part for part in inputs), **options
-        )
+        return getattr(ufunc, method)(*map(values_of, inputs), **options)
 
     def __init__(self, values: np.ndarray) -> None:
         self.values = values
@@ -146,36 +36,12 @@ class Memory(np.lib.mixins.NDArrayOperatorsMixin):
         return found.copy() if isinstance(found, np.ndarray) else found
 
     def __setitem__(self, key: object, value: object) -> None:
-        self.values[key] = _values(value)
+        self.values[key] = values_of(value)
 
 
-def _values(part: object) -> object:
+def values_of(part: object) -> object:
+    """Return what a thread's memory holds; other values as they are."""
     return part.values if isinstance(part, Memory) else part
-
-
-class Records(Memory):
-    """An array of Warp's, given as numpy's; elements of a structured one have fields that can be read and set."""
-
-    def __getitem__(self, key: object) -> object:
-        return _Record(self.values, key) if self.values.dtype.names else super().__getitem__(key)
-
-
-class _Record:
-    def __init__(self, values: np.ndarray, key: object) -> None:
-        object.__setattr__(self, "_at", (values, key))
-
-    def __getattr__(self, name: str) -> object:
-        values, key = self._at
-        found = values[name][key]
-        if found.dtype.names:
-            return SimpleNamespace(**{part: found[part].copy() for part in found.dtype.names})
-        return found.copy() if isinstance(found, np.ndarray) else found
-
-    def __setattr__(self, name: str, value: object) -> None:
-        values, key = self._at
-        if values[name].dtype.names:
-            value = tuple(tuple(_values(getattr(value, part))) for part in values[name].dtype.names)
-        values[name][key] = value
 
 
 class ThreadWarp:
@@ -237,7 +103,7 @@ class ThreadWarp:
         }
 
 
-def _language() -> ModuleType:
+def _language(natives: Mapping[str, Callable[..., object]]) -> ModuleType:
     """What kernel source asks of the module ``warp``, on numpy."""
     fake = ModuleType("warp")
 
@@ -253,8 +119,8 @@ def _language() -> ModuleType:
             return lambda _function: lambda memory, index: memory[index]
         if found := re.search(r"#else\nreturn a ([<>]) b \? a : b;", code):
             return lambda _function: min if found[1] == "<" else max
-        children = re.search(r"constexpr int children = (\d+);", code)
-        return lambda function: partial(NATIVES.get(function.__name__, function), int(children[1]) if children else 0)
+        children = [int(count) for count in re.findall(r"constexpr int children = (\d+);", code)]
+        return lambda function: partial(natives.get(function.__name__, function), *children)
 
     def zeroed(kind):
         def begin(self):
@@ -288,11 +154,13 @@ def _language() -> ModuleType:
 
 
 @contextmanager
-def thread_warp():
+def thread_warp(*functions: Callable[..., object]):
     """Give a :class:`ThreadWarp` and ``load(module, group_size=…, …)`` for kernel modules made anew on it.
 
-    The real modules come back after.
+    Native ``functions`` of the kernels are given in Python, by their names; the first argument of those that look at
+    children is the number that one thread looks at. The real modules come back after.
     """
+    natives = {function.__name__: function for function in functions}
     package = specialize.__module__
     kept = {name: module for name, module in sys.modules.items() if name == "warp" or name.startswith(f"{package}_")}
     threads = ThreadWarp()
@@ -307,7 +175,7 @@ def thread_warp():
     try:
         for name in kept:
             del sys.modules[name]
-        sys.modules["warp"] = _language()
+        sys.modules["warp"] = _language(natives)
         yield threads, load
     finally:
         for name in [name for name in sys.modules if name == "warp" or name.startswith(f"{package}_")]:

@@ -10,7 +10,7 @@ from brainbench.core.devices import to_struct
 from brainbench.stimuli.engines.rod.limits import contact_iterations
 from brainbench.stimuli.engines.rod.slices import make_problems
 from tests.factories.rod_chain import CAPACITY, DenseChain, in_double
-from tests.factories.rod_threads import Records, thread_warp
+from tests.factories.rod_threads import Memory, thread_warp, values_of
 
 wp = pytest.importorskip("warp")
 
@@ -205,6 +205,79 @@ def test_contacts_keep_signorini_and_coulomb(seed, friction, hinges, tolerance):
     assert (1 - opposed < 20 * off).all()
 
 
+class Records(Memory):
+    """An array of Warp's, given as numpy's; elements of a structured one have fields that can be read and set."""
+
+    def __getitem__(self, key: object) -> object:
+        return _Record(self.values, key) if self.values.dtype.names else super().__getitem__(key)
+
+
+class _Record:
+    def __init__(self, values: np.ndarray, key: object) -> None:
+        object.__setattr__(self, "_at", (values, key))
+
+    def __getattr__(self, name: str) -> object:
+        values, key = self._at
+        found = values[name][key]
+        if found.dtype.names:
+            return SimpleNamespace(**{part: found[part].copy() for part in found.dtype.names})
+        return found.copy() if isinstance(found, np.ndarray) else found
+
+    def __setattr__(self, name: str, value: object) -> None:
+        values, key = self._at
+        if values[name].dtype.names:
+            value = tuple(tuple(values_of(getattr(value, part))) for part in values[name].dtype.names)
+        values[name][key] = value
+
+
+def pass_joint(joints, joint, twists, step, _each, unit):
+    j, w, v = joints[joint], unit.w.values, unit.v.values
+
+    def rates(which):
+        motion = getattr(j, f"motion{which}")
+        return motion.w @ w + motion.v @ v
+
+    def pass_on(which, rate):
+        gain = getattr(j, f"gain{which}")
+        w[:] -= np.outer(gain.w, rate)
+        v[:] -= np.outer(gain.v, rate)
+
+    inverse = j.inverse_inertia
+    if twists:
+        unit.joint_rate.values[2] = rates(3)
+        unit.impulse.values[2] = step * inverse[3] * unit.joint_rate.values[2]
+        pass_on(3, unit.joint_rate.values[2])
+    u = unit.joint_rate.values[:2]
+    u[:] = rates(1), rates(2)
+    unit.impulse.values[:2] = step * np.array([inverse[:2], inverse[1:3]]) @ u
+    pass_on(1, u[0])
+    pass_on(2, u[1])
+
+
+def joint_rate(unit, hinge, row):
+    return unit.joint_rate.values[hinge, row]
+
+
+def _columns(matrix, rows, contact):
+    return matrix.values.reshape(-1, rows)[3 * contact : 3 * contact + 3]
+
+
+def add_joint(unit, contact, rate1, rate2, rate3, twists, _first, _each, matrix):
+    impulse = unit.impulse.values
+    columns = _columns(matrix, impulse.shape[1], contact)
+    columns += np.outer(rate1, impulse[0]) + np.outer(rate2, impulse[1])
+    if twists:
+        columns += np.outer(rate3, impulse[2])
+
+
+def clear(matrix, _count, _each):
+    matrix.values[:] = 0
+
+
+def add_rates(own, matrix, contact, force, _each):
+    own.rate.values += force @ _columns(matrix, len(own.rate.values), contact)
+
+
 # Few iterations do not find a direction of slip in the second problem.
 @pytest.mark.slow
 @pytest.mark.parametrize(("seed", "tolerance", "unsolved"), [(1, None, 0), (2, None, 1), (2, 1e-8, 0)])
@@ -213,7 +286,7 @@ def test_a_group_of_threads_finds_what_one_finds(seed, tolerance, unsolved):
     alone, added, told = _solve(problem, tolerance)
     problems = _factorised(problem, tolerance)
     size = 4
-    with thread_warp() as (threads, load):
+    with thread_warp(pass_joint, joint_rate, add_joint, clear, add_rates) as (threads, load):
         solver = load("contact_solver", group_size=size, max_contacts=size, capacity=CAPACITY)
         given = SimpleNamespace(**{name: Records(getattr(problems, name).numpy()) for name in ARRAYS})
         vars(given).update({name: getattr(problems, name) for name in LIMITS})

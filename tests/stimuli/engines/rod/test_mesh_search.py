@@ -4,9 +4,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear
 
 from brainbench.core.devices import to_struct
 from brainbench.geometry import Mesh
+from brainbench.geometry.mesh import point_triangle_distance
 from brainbench.stimuli.engines.rod.kernels import specialize
 from brainbench.stimuli.engines.rod.limits import WIDE
 from brainbench.stimuli.engines.rod.packing import EMPTY, PackedShapes, PackedSurface, spatial_order, tree_boxes
@@ -275,6 +277,54 @@ def test_triangles_measured_side_by_side_are_those_measured_one_by_one():
     assert len(np.unique(together[:, 3] % WIDE)) == WIDE
 
 
+def _segments_apart(a, b, p, q):
+    """Least squared distance of two segments."""
+    return 2 * lsq_linear(np.stack([b - a, p - q], axis=1), p - a, bounds=(0, 1), method="bvls").cost
+
+
+def _segment_triangle(a, b, corners):
+    """Squared distance of a segment from the edges of a triangle; 0 where it pierces the face."""
+    matrix = np.stack([corners[1] - corners[0], corners[2] - corners[0], a - b], axis=1)
+    if abs(np.linalg.det(matrix)) > 1e-24:
+        v, w, share = np.linalg.solve(matrix, a - corners[0])
+        if min(v, w, share, 1 - share, 1 - v - w) >= 0:
+            return 0.0
+    return min(_segments_apart(a, b, corners[k], corners[k - 1]) for k in range(3))
+
+
+def measure_triangles(children, corners, leaf, first, count, part, line, _bounds, got):
+    own = range(min(children, count - first))
+    triangles = [corners[leaf][:, children * part + k].reshape(3, 3) for k in own]
+    for k, triangle in enumerate(triangles):
+        ends = [float(point_triangle_distance(x[None], triangle[None])[0]) ** 2 for x in (line.b, line.a)]
+        for name, face, square in (
+            ("side", "face", _segment_triangle(line.a, line.b, triangle)),
+            ("end", "end_face", ends[0]),
+            ("start", "start_face", ends[1]),
+        ):
+            if square < getattr(got, name):
+                setattr(got, name, square)
+                setattr(got, face, first + k)
+
+
+def bound_boxes(children, boxes, node, part, line, _bounds, level, side, end):
+    for k in range(children):
+        low, high = boxes[node][:, children * part + k].reshape(2, 3)
+        ends = np.stack([line.a, line.b])
+        gap = np.maximum(np.maximum(low - ends.max(axis=0), ends.min(axis=0) - high), 0)
+        away = np.maximum(np.maximum(low - line.b, line.b - high), 0)
+        side[level, k], end[level, k] = gap @ gap, away @ away
+
+
+def nearest_child(children, side, end, level, part, bounds):
+    code = 2**31 - 1
+    for k in range(children):
+        if side[level, k] < bounds.side or end[level, k] < bounds.end:
+            bits = int(np.float32(side[level, k]).view(np.int32))
+            code = min(code, (bits & -WIDE) + children * part + k)
+    return code
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("lanes", [2, 4, 8])
 def test_threads_that_search_together_find_what_one_finds(lanes):
@@ -289,7 +339,7 @@ def test_threads_that_search_together_find_what_one_finds(lanes):
     counts = (alone <= within**2) & (np.arange(3) < 2)
     alone = np.where((alone == alone.min(axis=1, keepdims=True)) | counts, alone, np.nan)
     arrays = _shapes(surface)
-    with thread_warp() as (threads, load):
+    with thread_warp(measure_triangles, bound_boxes, nearest_child) as (threads, load):
         nearest = load("mesh_search", group_size=lanes).nearest_triangles
         bodies = SimpleNamespace(**{name: Memory(values) for name, values in arrays.items()})
         for begin in range(0, len(starts), count):
