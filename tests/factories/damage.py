@@ -9,8 +9,8 @@ import os
 import random
 import re
 import zipfile
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial, reduce
 from pathlib import Path
 from typing import Any
 
@@ -128,65 +128,67 @@ def _text(path: Path, chance: random.Random) -> str:
     return f"{token[:12]} for {found.group()[:12]!r}"
 
 
+def _put(holder: Any, key: str, table: Mapping[str, Sequence[Any]], chance: random.Random) -> str:
+    """Put a value of a table, by its kind, in the place of an entry, or drop or rename that; functions put it there."""
+    kind, old = chance.choice((*table, "drop", "rename")), holder[key]
+    del holder[key]
+    value = old if kind == "rename" else None if kind == "drop" else chance.choice(table[kind])
+    if callable(value):
+        value(holder, key)
+    elif kind != "drop":
+        holder["other" if kind == "rename" else key] = value
+    return f"{kind} {key}"
+
+
+def _spoil(values: np.ndarray, chance: random.Random) -> str:
+    """Put an odd number, which its kind can hold, in the place of one of an array."""
+    whole = {"i": (0, 1, 127, -1), "u": (0, 1, 127, 200)}
+    number = chance.choice(whole.get(values.dtype.kind, _NUMBERS))
+    with np.errstate(over="ignore"):
+        values.flat[chance.randrange(values.size)] = number
+    return f"{number}"
+
+
+_LINKS = {
+    "group": (h5py.File.create_group,),
+    "dangling": (h5py.SoftLink("/nowhere"),),
+    "external": (h5py.ExternalLink("/dev/zero", "/x"),),
+}
+_ATTRIBUTES = {"number": (np.nan,), "array": (np.arange(4.0),), "text": ("[" * 2000,), "empty": (h5py.Empty("f4"),)}
+
+
 def _hdf5(path: Path, chance: random.Random) -> str:
     with h5py.File(path, "r+") as file:
         names: list[str] = []
         file.visit(names.append)
         name = chance.choice(names)
-        item = file[name]
         places = [key for key in (name, *names, "/") if file[key].attrs]
         if places and chance.random() < 0.25:
             attributes = file[chance.choice(places)].attrs
-            return _attribute(attributes, chance.choice(list(attributes)), chance)
-        kinds = ["delete", "group", "dangling", "external"]
-        if isinstance(item, h5py.Dataset):
-            kinds += ["number"] * 5 + ["type", "shape", "huge", "null", "reference"]
-        kind = chance.choice(kinds)
-        if kind == "number":
-            if item.dtype.kind not in "fiu" or not item.size:
-                kind = "type"
-            else:
-                values = np.asarray(item[()])
-                number = chance.choice(_NUMBERS)
-                if item.dtype.kind in "iu":
-                    number = chance.choice((0, 1, 127, -1 if item.dtype.kind == "i" else 200))
-                flat = values.reshape(-1)
-                with np.errstate(over="ignore"):
-                    flat[chance.randrange(flat.size)] = number
-                item[()] = flat.reshape(values.shape)
-                return f"{number} in {name}"
-        old = np.asarray(item[()]) if isinstance(item, h5py.Dataset) else np.zeros(2)
-        del file[name]
-        if kind == "group":
-            file.create_group(name)
-        elif kind == "dangling":
-            file[name] = h5py.SoftLink("/nowhere")
-        elif kind == "external":
-            file[name] = h5py.ExternalLink("/dev/zero", "/x")
-        elif kind == "type":
-            file[name] = chance.choice(
-                [np.array([b"x"] * 3), np.full(old.shape, True), np.full(old.shape, 1 + 2j), np.zeros(old.shape, "i1"),
-                 np.zeros(old.shape, [("a", "f4"), ("b", "S3")]), b"text"]
-            )  # fmt: skip
-        elif kind == "shape":
-            file[name] = chance.choice([old[None], old.reshape(-1)[:-1], old.reshape(-1)[:1], np.zeros((0, 3))])
-        elif kind == "huge":
-            shape = tuple(2**20 for _ in range(max(1, old.ndim)))
-            file.create_dataset(name, shape=shape if old.ndim > 1 else (2**36,), dtype="f8", chunks=True)
-        elif kind == "null":
-            file[name] = h5py.Empty("f8")
-        elif kind == "reference":
-            file.create_dataset(name, data=np.array([file.ref] * 2, dtype=object), dtype=h5py.ref_dtype)
-        return f"{kind} {name}"
+            return f"attribute {_put(attributes, chance.choice(list(attributes)), _ATTRIBUTES, chance)}"
+        item = file[name]
+        if not isinstance(item, h5py.Dataset):
+            return _put(file, name, _LINKS, chance)
+        old = np.asarray(item[()])
+        if old.dtype.kind in "fiu" and old.size and chance.random() < 0.4:
+            what = _spoil(old, chance)
+            item[()] = old
+            return f"{what} in {name}"
+        shape, empty = old.shape, np.zeros((0, 3))
+        endless = {"shape": (2**20,) * old.ndim if old.ndim > 1 else (2**36,), "dtype": "f8", "chunks": True}
+        references = {"data": np.array([file.ref] * 2, dtype=object), "dtype": h5py.ref_dtype}
+        kinds = (np.full(shape, True), np.full(shape, 1 + 2j), np.zeros(shape, "i1"), np.zeros(shape, "f4,S3"))
+        odd = {
+            "type": (np.array([b"x"] * 3), *kinds, b"text"),
+            "shape": (old[None], old.reshape(-1)[:-1], old.reshape(-1)[:1], empty),
+            "null": (h5py.Empty("f8"),),
+            "made": [partial(_dataset, **options) for options in (endless, references)],
+        }
+        return _put(file, name, _LINKS | odd, chance)
 
 
-def _attribute(attributes: h5py.AttributeManager, name: str, chance: random.Random) -> str:
-    kind = chance.choice(("delete", "number", "array", "text", "empty"))
-    del attributes[name]
-    if kind != "delete":
-        choices = {"number": np.nan, "array": np.arange(4.0), "text": "[" * 2000, "empty": h5py.Empty("f4")}
-        attributes[name] = choices[kind]
-    return f"attribute {name}: {kind}"
+def _dataset(file: h5py.File, name: str, **options: Any) -> None:
+    file.create_dataset(name, **options)
 
 
 def _tensors(path: Path, chance: random.Random) -> str:
@@ -194,20 +196,19 @@ def _tensors(path: Path, chance: random.Random) -> str:
     length = int.from_bytes(data[:8], "little")
     header, body = json.loads(data[8 : 8 + length]), bytearray(data[8 + length :])
     name = chance.choice([key for key in header if key != "__metadata__"])
-    kind = chance.choice(("nan", "inf", "shape", "dtype", "drop", "rename", "offset", "length", "deep"))
-    if kind in ("nan", "inf"):
+    fields = {
+        "shape": ([2**40], [], [1], [-1], [2**62, 4]),
+        "dtype": ("F64", "I8", "XX", 3, None),
+        "data_offsets": ([0, 2**50], [-4, 0], [8, 4], ["a", 1]),
+    }
+    kind = chance.choice(("number", "number", "entry", "entry", "length", "deep", *fields))
+    if kind == "number":
         first = header[name]["data_offsets"][0]
-        body[first : first + 4] = np.float32(np.nan if kind == "nan" else np.inf).tobytes()
-    elif kind == "shape":
-        header[name]["shape"] = chance.choice([[2**40], [], [1], [-1], [2**62, 4]])
-    elif kind == "dtype":
-        header[name]["dtype"] = chance.choice(["F64", "I8", "XX", 3, None])
-    elif kind == "drop":
-        del header[name]
-    elif kind == "rename":
-        header["other"] = header.pop(name)
-    elif kind == "offset":
-        header[name]["data_offsets"] = chance.choice([[0, 2**50], [-4, 0], [8, 4], ["a", 1]])
+        body[first : first + 4] = np.float32(chance.choice((np.nan, np.inf))).tobytes()
+    elif kind == "entry":
+        kind = _put(header, name, {}, chance)
+    elif kind in fields:
+        header[name][kind] = chance.choice(fields[kind])
     text = b"[" * 50_000 if kind == "deep" else json.dumps(header).encode()
     size = 2**40 if kind == "length" else len(text)
     path.write_bytes(size.to_bytes(8, "little") + text + body)
@@ -219,30 +220,22 @@ def _npz(path: Path, chance: random.Random) -> str:
         arrays = {name: stored[name] for name in stored.files}
     name = chance.choice(list(arrays))
     values = arrays[name]
-    kind = chance.choice(
-        ("number", "number", "number", "drop", "rename", "shape", "type", "objects", "header", "foreign")
-    )
-    if kind == "number" and values.dtype.kind == "f" and values.size:
-        number = chance.choice(_NUMBERS)
-        values.reshape(-1)[chance.randrange(values.size)] = number
-        kind = f"{number}"
-    elif kind in ("drop", "rename"):
-        del arrays[name]
-        arrays |= {"other": values} if kind == "rename" else {}
-    elif kind == "shape":
-        arrays[name] = chance.choice([values[None], values.reshape(-1)[:-1], np.zeros((0, 6, 2)), np.zeros(())])
-    elif kind == "objects":
-        arrays[name] = np.array([{}, None], dtype=object)
-    else:
-        others = ([b"x"], [True] * 3, [1j], np.nan, "NaN", "9" * 5000, -1, 1e300, [np.datetime64("NaT")])
-        arrays[name] = np.array(chance.choice(others))
+    odd = ([b"x"], [True] * 3, [1j], np.nan, "NaN", "9" * 5000, -1, 1e300, [np.datetime64("NaT")])
+    table = {
+        "shape": (values[None], values.reshape(-1)[:-1], np.zeros((0, 6, 2)), np.zeros(())),
+        "type": [np.array(value) for value in odd],
+        "objects": (np.array([{}, None], dtype=object),),
+    }
+    numeric = values.dtype.kind == "f" and values.size and chance.random() < 0.3
+    what = _spoil(values, chance) if numeric else _put(arrays, name, table, chance)
     np.savez(path, **arrays)
-    if kind in ("header", "foreign"):
+    if chance.random() < 0.2:
         with zipfile.ZipFile(path, "a") as archive, archive.open("extra.npy", "w") as stream:
-            shape = chance.choice(((2**40,), (2**62, 4), (-1,), ("a",), (3,)))
+            shape = chance.choice(((2**40,), (2**62, 4), (-1,), ("a",), (3,), None))
             header = {"descr": "<f8", "fortran_order": False, "shape": shape}
-            stream.write(b"<a/>") if kind == "foreign" else np.lib.format.write_array_header_1_0(stream, header)
-    return f"{kind} {name}"
+            stream.write(b"<a/>") if shape is None else np.lib.format.write_array_header_1_0(stream, header)
+            what += f", {shape} more"
+    return what
 
 
 class Unknown:
@@ -253,39 +246,30 @@ def _checkpoint(path: Path, chance: random.Random) -> str:
     content = torch.load(path, weights_only=True)
     state = content["state_dict"]
     name = chance.choice([key for key, value in state.items() if value.ndim])
-    kind = chance.choice(
-        ("nan", "inf", "drop", "rename", "shape", "huge", "type", "object", "epoch", "state", "deep", "sparse", "meta")
-    )
-    if kind in ("nan", "inf"):
-        state[name] = state[name].clone()
-        state[name].reshape(-1)[0] = float(kind)
-    elif kind in ("drop", "rename"):
-        state["other"] = state.pop(name)
-        del state["other" if kind == "drop" else next(iter(state))]
-    elif kind == "shape":
-        state[name] = chance.choice([state[name][None], state[name][:0], torch.zeros(()), torch.zeros(3, 70)])
-    elif kind == "huge":
+    value, nested = state[name], reduce(lambda inner, _: [inner], range(400), name)
+    first = torch.zeros_like(value, dtype=torch.bool)
+    first.view(-1)[0] = True
+    weights = {
+        "not finite": [value.masked_fill(first, number) for number in (math.nan, math.inf)],
+        "shape": (value[None], value[:0], torch.zeros(()), torch.zeros(3, 70)),
         # A single stored number stands for as many as one likes.
-        state[name] = torch.zeros(1).expand(2**40)
-    elif kind == "type":
-        state[name] = chance.choice(
-            [state[name].to(torch.complex64), state[name].bool(), state[name].to(torch.float16) * 1e6, "x", None, 3]
-        )
-    elif kind == "object":
-        content["hyper_parameters"] = Unknown()
-    elif kind == "epoch":
-        content["epoch"] = chance.choice([-1, float("nan"), "x", 2**80, None, [1]])
-    elif kind == "state":
-        content["state_dict"] = chance.choice([3, {}, {"a": {}}, {3: torch.zeros(1)}, [torch.zeros(2)], {"": name}])
-    elif kind == "deep":
-        nested: Any = name
-        for _ in range(400):
-            nested = [nested]
-        content["state_dict"] = {**state, name: nested}
+        "huge": (torch.zeros(1).expand(2**40),),
+        "type": (value.to(torch.complex64), value.bool(), value.to(torch.float16) * 1e6, "x", None, 3),
+        "elsewhere": (value.to_sparse(), value.to("meta")),
+        "deep": (nested,),
+    }
+    entries = {
+        "hyper_parameters": (Unknown(),),
+        "epoch": (-1, math.nan, "x", 2**80, None, [1]),
+        "state_dict": (3, {}, {"a": {}}, {3: torch.zeros(1)}, [torch.zeros(2)], {"": name}),
+    }
+    if chance.random() < 0.75:
+        what = _put(state, name, weights, chance)
     else:
-        state[name] = state[name].to_sparse() if kind == "sparse" else state[name].to("meta")
+        what = chance.choice(list(entries))
+        content[what] = chance.choice(entries[what])
     torch.save(content, path)
-    return f"{kind} {name}"
+    return what
 
 
 def mutate(value: Any, seed: int) -> Any:
