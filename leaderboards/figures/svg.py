@@ -11,26 +11,13 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from html import escape
+from pathlib import Path
 
 from brainbench.core.errors import visible_lines
 from brainbench.core.records import Interval
 from brainbench.core.statistics import is_finite
 
-STYLE = """
-svg.figure{font:12px system-ui,-apple-system,"Segoe UI",Roboto,"Helvetica Neue",Arial,sans-serif;fill:#17202b}
-.figure text{fill:#17202b}.figure .quiet{fill:#566373}.figure .title{font-weight:650}.figure .small{font-size:10.5px}
-.figure .end{text-anchor:end}.figure .mid{text-anchor:middle}.figure .line{fill:none;stroke:#8a95a3}
-.figure .grid{stroke:#e3e8ee}.figure .one{stroke:#566373;stroke-dasharray:2 3}
-.figure .band{fill:#2b7a3d;fill-opacity:.13}
-.figure .fit{fill:none;stroke:#17202b;stroke-width:1.5}.figure .fitband{fill:#17202b;fill-opacity:.09}
-.figure .span{stroke-width:2}.figure .open{fill:#fff}.figure .faint{fill-opacity:.45;stroke-opacity:.6}
-.figure .c0{fill:#5b6472;stroke:#5b6472}.figure .c1{fill:#0a5ca8;stroke:#0a5ca8}.figure .c2{fill:#c2410c;stroke:#c2410c}
-.figure .c3{fill:#0f766e;stroke:#0f766e}.figure .c4{fill:#7c3aed;stroke:#7c3aed}.figure .c5{fill:#a16207;stroke:#a16207}
-.figure .c6{fill:#be185d;stroke:#be185d}.figure .c7{fill:#4d7c0f;stroke:#4d7c0f}.figure .c8{fill:#0369a1;stroke:#0369a1}
-.figure .open{fill:#fff}.figure text{stroke:none}.figure .edge{fill:none;stroke:#566373;stroke-width:1.4}
-.figure .feedback{stroke:#c2410c;stroke-dasharray:5 3}.figure .box{fill:#f4f6f9;stroke:#b7c1cd}
-.figure .trace{fill:none;stroke-width:1.8}
-"""
+STYLE = (Path(__file__).parents[1] / "templates" / "figure.css").read_text(encoding="utf-8")
 """Colours of a drawing that stands alone; the pages bring their own for light and dark."""
 
 COLOURS = 8  # classes `c1` to `c8`; `c0` is grey

@@ -237,34 +237,8 @@ def _score_view(record: ResultRecord) -> dict[str, Any]:
     }
 
 
-COLUMNS: tuple[dict[str, Any], ...] = (
-    {"key": "rank", "label": "rank", "title": "rank", "number": True, "shown": True},
-    {"key": "name", "label": "model", "title": "model", "shown": True},
-    {"key": "score", "label": "score", "title": "score and interval", "number": True, "shown": True, "down": True},
-    {"key": "interval", "label": "interval", "title": "interval as a picture", "shown": True},
-    {"key": "unique", "label": "unique", "title": "unique part, beyond raw input and contacts", "number": True,
-     "wide": True, "down": True, "shown": True},
-    {"key": "standing", "label": "standing", "title": "standing", "wide": True, "shown": True},
-    {"key": "p", "label": "p", "title": "permutation p", "number": True, "wide": True, "shown": True},
-    {"key": "spread", "label": "spread", "title": "spread over seeds", "number": True, "wide": True},
-    {"key": "value", "label": "value", "title": "value in the metric's own unit", "number": True, "wide": True,
-     "down": True, "shown": True},
-    {"key": "r", "label": "raw r", "title": "raw r", "number": True, "wide": True, "down": True},
-    {"key": "top1", "label": "top-1", "title": "top-1 accuracy", "number": True, "wide": True, "down": True},
-    {"key": "top5", "label": "top-5", "title": "top-5 accuracy", "number": True, "wide": True, "down": True},
-    {"key": "layer", "label": "layer", "title": "layer", "wide": True, "shown": True},
-    {"key": "parameters", "label": "parameters", "title": "parameters", "number": True, "whole": True, "wide": True,
-     "down": True},
-    {"key": "multiply_adds", "label": "multiply-adds", "title": "multiply-adds per step", "number": True,
-     "whole": True, "wide": True, "down": True},
-    {"key": "encoder", "label": "encoder", "title": "encoder", "wide": True},
-    {"key": "attender", "label": "attender", "title": "attender", "wide": True},
-    {"key": "objective", "label": "objective", "title": "objective", "wide": True},
-    {"key": "augmentation", "label": "augmentation", "title": "augmentation", "wide": True},
-    {"key": "seeds", "label": "seeds", "title": "number of seeds", "number": True, "whole": True, "wide": True},
-    {"key": "animals", "label": "animals", "title": "number of animals", "number": True, "whole": True, "wide": True},
-    {"key": "version", "label": "version", "title": "brainbench version", "wide": True},
-)  # fmt: skip
+COLUMNS: list[dict[str, Any]] = read_json(_TEMPLATES / "columns.json")
+"""Columns of the table on the first page, as ``page.js`` takes them."""
 
 _COMMON = ("benchmark", "recordings", "recordings_hash", "stimuli_hash", "time", "estimator", "metric", "synthetic")
 _CARD = ("family", "encoder", "attender", "objective", "augmentation", "parameters", "multiply_adds", "top1", "top5")
