@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import json
 import math
@@ -31,7 +30,7 @@ from brainbench.core.errors import (
     unknown_name,
     visible,
 )
-from brainbench.core.files import atomic_path, cache_dir, content_hash, file_hash, settings_dir, to_plain
+from brainbench.core.files import atomic_path, cache_dir, content_hash, file_hash, settings_dir, state_hash, to_plain
 from brainbench.core.limits import Count, Limit, limited
 from brainbench.core.plugins import load_entry_points
 from brainbench.core.progress import Progress
@@ -281,10 +280,10 @@ def _unpacked(path: Path) -> tuple[Benchmark, Path]:
     with readable(path, "benchmark (.zip)"), zipfile.ZipFile(path) as archive:
         check_archive(archive, path, "benchmark")
         benchmark = _definition(archive, where)
-        folder = cache_dir("benchmarks", _hash(path)[:32])  # another archive is unpacked, and so compared, itself
+        folder = cache_dir("benchmarks", state_hash(path)[:32])  # another archive is unpacked, and so compared, itself
         for name, digest in benchmark.files.items():
             target = folder / name
-            if target.is_file() and not target.is_symlink() and _hash(target) == digest:
+            if target.is_file() and not target.is_symlink() and state_hash(target) == digest:
                 continue
             with atomic_path(target) as temporary:
                 hashed = _extract(archive, name, temporary)
@@ -338,20 +337,8 @@ def _compare(benchmark: Benchmark, folder: Path, name: str) -> None:
     except BrainbenchError as error:
         where = ", ".join(filter(None, (origin.source, origin.doi)))
         raise type(error)(f"{error} Get it{f' from {where}' if where else ''}, or score on the .zip.") from error
-    if (hashed := _hash(place)) != digest:
+    if (hashed := state_hash(place)) != digest:
         raise DataError(_changed(benchmark, name, digest, hashed))
-
-
-def _hash(path: Path) -> str:
-    state = path.stat()
-    return _digest(path, state.st_size, state.st_mtime_ns, state.st_ctime_ns, state.st_ino)
-
-
-@functools.lru_cache(maxsize=4096)
-def _digest(path: Path, *state: int) -> str:
-    """Hash a file once for each state of it: a batch opens a benchmark for every model."""
-    del state
-    return file_hash(path, length=64)
 
 
 def _changed(benchmark: Benchmark, name: str, stated: str, hashed: str) -> str:

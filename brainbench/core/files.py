@@ -347,6 +347,18 @@ def file_hash(path: str | os.PathLike[str], *, length: int = 16) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()[:length]
 
 
+def state_hash(path: Path) -> str:
+    """Return the whole hash of a file, taken once for each state of it (size, times, place on the disk)."""
+    state = path.stat()
+    return _hash_once(path, state.st_size, state.st_mtime_ns, state.st_ctime_ns, state.st_ino)
+
+
+@functools.lru_cache(maxsize=4096)
+def _hash_once(path: Path, *state: int) -> str:
+    del state
+    return file_hash(path, length=64)
+
+
 def hash_arrays(arrays: Mapping[str, Any]) -> str:
     """Hash arrays by name, type, shape and bytes, in alphabetical order of their names (SHA-256, 32 digits).
 

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError
-from brainbench.core.files import atomic_path, content_hash, file_hash, library_versions, settings_dir, write_private
+from brainbench.core.files import atomic_path, content_hash, library_versions, settings_dir, state_hash, write_private
 from brainbench.core.reading.hdf5 import trust_hdf5
 from brainbench.core.reading.tensors import read_npz
 
@@ -88,7 +88,7 @@ def write_sealed(path: Path, what: str, arrays: Mapping[str, Any], *, compress: 
 def seal_file(file: Path, place: Path | None = None) -> None:
     """Note that a file is what belongs at a place, by default where it is."""
     place = place or file
-    line = _seal(place, file_hash(file, length=64))
+    line = _seal(place, state_hash(file))
     if line not in _lines(place):
         # Appended, so that of two processes that write an entry at once neither takes away the other's seal.
         handle = os.open(_beside(place), os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
@@ -99,18 +99,10 @@ def seal_file(file: Path, place: Path | None = None) -> None:
 def is_sealed(path: Path) -> bool:
     """Return whether a file is there with bytes that :func:`seal_file` saw, under this user's key."""
     try:
-        state = path.stat()
-        digest = _digest(path, state.st_size, state.st_mtime_ns, state.st_ctime_ns, state.st_ino)
+        digest = state_hash(path)
         return any(hmac.compare_digest(line, _seal(path, digest)) for line in _lines(path))
     except OSError:
         return False
-
-
-@functools.lru_cache(maxsize=256)
-def _digest(path: Path, *state: int) -> str:
-    """Hash a file once for each state of it."""
-    del state
-    return file_hash(path, length=64)
 
 
 def _beside(place: Path) -> Path:
