@@ -151,22 +151,8 @@ def _mesh(suffix: str, folder: Path) -> Path:
     return save_mesh(folder / f"mesh{suffix}", tetrahedron, unit="mm")
 
 
-def _run(name: str, folder: Path) -> Path:
-    run = write_run(folder / "run", np.random.default_rng(0).normal(size=(110, 2, 6)))
-    found = run / name
-    if found.parent != run:
-        # The damaged file lies directly in the folder that is copied.
-        (run / "moved").write_text(name)
-        found = found.rename(run / found.name)
-    return found
-
-
-def _read_run(path: Path) -> Any:
-    moved = path.parent / "moved"
-    if moved.exists():
-        path.replace(path.parent / moved.read_text())
-        moved.unlink()
-    return read_runs([path.parent])
+def _run(folder: Path) -> Path:
+    return write_run(folder / "run", np.random.default_rng(0).normal(size=(110, 2, 6)))
 
 
 def _bad_run(dataset: Any) -> bool:
@@ -456,8 +442,14 @@ SURFACES = (
         Surface(f"mesh, {suffix[1:].upper()}", partial(_mesh, suffix), lambda path: load_mesh(path, unit="mm"))
         for suffix in (".obj", ".stl", ".ply", ".off", ".glb")
     ),
-    Surface("WHISKiT names", partial(_run, "whisker_ID.csv"), _read_run, _bad_run),
-    Surface("WHISKiT table", partial(_run, "dynamics/Fx.csv"), _read_run, _bad_run),
+    Surface(
+        "WHISKiT names", lambda folder: _run(folder) / "whisker_ID.csv",
+        lambda path: read_runs([path.parent]), _bad_run,
+    ),
+    Surface(
+        "WHISKiT table", lambda folder: _run(folder) / "dynamics" / "Fx.csv",
+        lambda path: read_runs([path.parents[1]]), _bad_run, inside=1,
+    ),
     Surface("trajectory", partial(_table, 12), load_trajectory),
     Surface("starting angles", partial(_table, 3), load_initial_angles),
     Surface("network, JSON", written_json("graph.json", GRAPH), read_graph, _bad_graph),

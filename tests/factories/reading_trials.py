@@ -75,6 +75,13 @@ class Surface:
     """Reads it, given the path of that file."""
     faults: Callable[[Any], bool] = not_finite
     """True for a result that holds a number which is not finite or out of range."""
+    inside: int = 0
+    """Folders of the input around that file."""
+
+    def copy(self, good: Path, folder: Path) -> Path:
+        """Copy a good input to a folder; return the file there."""
+        root = good.parents[self.inside]
+        return shutil.copytree(root, folder) / good.relative_to(root)
 
 
 @dataclass(frozen=True)
@@ -95,8 +102,7 @@ def attempt(surface: Surface, good: Path, seed: int, change: Callable[[Path, int
     """Change a copy of the folder of ``good``, by default by damage, and read it."""
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "case"
-        shutil.copytree(good.parent, copy)
-        path = copy / good.name
+        path = surface.copy(good, copy)
         what = change(path, seed)
         before = _entries(copy)
         try:

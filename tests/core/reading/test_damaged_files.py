@@ -1,7 +1,5 @@
 """Every reader of users' files, fed with seeded damage: it refuses in one sentence, or what it returns is sound."""
 
-import shutil
-
 import pytest
 
 from tests.factories.reading_surfaces import SURFACES
@@ -42,5 +40,4 @@ def test_much_damage_is_refused_in_one_sentence(surface, goods):
 @pytest.mark.parametrize("surface", CASES)
 def test_what_is_whole_is_read(surface, goods, tmp_path):
     good = goods(surface)
-    copy = shutil.copytree(good.parent, tmp_path / "copy") / good.name
-    assert not surface.faults(surface.read(copy))
+    assert not surface.faults(surface.read(surface.copy(good, tmp_path / "copy")))

@@ -14,8 +14,23 @@ from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.jobs import Trace
 from brainbench.stimuli.validation import bench_tests, references
 from brainbench.stimuli.validation.bench_tests import PointLoad, ringdown
+from brainbench.stimuli.whiskers.array import WhiskerArray
+from brainbench.stimuli.whiskers.whisker import Whisker
 from tests.factories.contact_scenes import HARD_OBJECTS, contact_jobs, difference
-from tests.factories.whiskers import C2, GATE_WHISKERS, RAT
+from tests.factories.whiskers import C2, RAT
+
+
+def _gate_whiskers() -> dict[str, Whisker]:
+    mouse, rat = WhiskerArray.mouse(), WhiskerArray.rat()
+    published = [mouse["C2"], mouse["A4"], mouse["E5"], rat["C1"]]
+    rods = [replace(mount.whisker, curvature=0.0) for mount in published]
+    uniform = Whisker(0.015, 30e-6, 30e-6, young_modulus=5e9, density=1300.0, damping_ratio=0.32)
+    steep = Whisker(0.020, 60e-6, 3e-6, young_modulus=3e9, density=1300.0, damping_ratio=0.32)
+    return dict(zip(("C2", "A4", "E5", "rat C1", "uniform", "steep"), [*rods, uniform, steep], strict=True))
+
+
+GATE_WHISKERS = _gate_whiskers()
+"""Straight whiskers on which every preset has to keep its promise, by name."""
 
 
 def _trace(wrench, status="ok"):
