@@ -1,41 +1,14 @@
 import json
 import math
-from dataclasses import replace
 
 from brainbench.core.files import to_json
 from brainbench.core.provenance import Provenance, UniquePart
-from brainbench.core.records import (
-    Ceiling,
-    Interval,
-    LayerScore,
-    Score,
-    SubjectScore,
-)
-
-
-def _make_score(**changes: object) -> Score:
-    score = Score(
-        "zhuang",
-        0.8,
-        "ok",
-        r=0.7,
-        reliability=0.9,
-        interval=Interval(0.6, 1.1, method="t"),
-        p=0.01,
-        ceiling=Ceiling(0.8, 0.9),
-        layer="conv2",
-        layers=(LayerScore("conv1", math.nan, math.nan, "undefined"), LayerScore("conv2", 0.8, 0.7)),
-        subjects=(SubjectScore("a", 0.8, 0.7, 0.9, units=3, trials=7, layer="conv2"),),
-        stimuli=("x", "y", "z"),
-        model_rdm=(0.1, 0.2, math.nan),
-        provenance={"time": "now", "seed": 0},
-    )
-    return replace(score, **changes)
+from tests.factories.records import three_stimuli_score
 
 
 def test_provenance_is_typed_and_keeps_what_it_does_not_know():
     stated = {"version": "0.1.0", "recordings": {"source": "demo"}, "seed": 3, "command": 7, "settings": {}}
-    origin = _make_score(provenance=stated).provenance
+    origin = three_stimuli_score(provenance=stated).provenance
     assert isinstance(origin, Provenance)
     assert (origin.version, origin.recordings["source"]) == ("0.1.0", "demo")
     assert origin.command == ""  # of another kind, so it counts as absent
@@ -69,12 +42,12 @@ def test_a_unique_part_is_read_where_numbers_state_it():
         "shared": 0.1,
         "controls": ["raw"],
     }
-    part = _make_score(provenance={"statistics": {"unique": stated}}).provenance.unique
+    part = three_stimuli_score(provenance={"statistics": {"unique": stated}}).provenance.unique
     assert part is not None
     assert (part.unique, part.low, part.high, part.shared, part.controls) == (0.5, 0.25, 0.75, 0.1, ("raw",))
-    assert _make_score().provenance.unique is None
+    assert three_stimuli_score().provenance.unique is None
     for damaged in ({"unique": "1"}, {"unique": True, "interval": 3}, {"unique": None, "interval": [1], "controls": 4}):
-        part = _make_score(provenance={"statistics": {"unique": damaged}}).provenance.unique
+        part = three_stimuli_score(provenance={"statistics": {"unique": damaged}}).provenance.unique
         assert part is not None
         assert math.isnan(part.unique)
         assert math.isnan(part.low)

@@ -92,3 +92,36 @@ def run_policy(*arguments: object, code: int = 0) -> str:
         raise result.exception
     assert result.exit_code == code, result.output
     return result.stdout
+
+
+NETWORK, ITEMS, GROUPS = "zhuang-intersection-ln-small", 45, {"student": ["proprio", "goal", "tactile"]}
+"""A network, taxels of a finger, and what a student reads."""
+
+
+def student_observations(batch: int, steps: int = 1, seed: int = 0) -> TensorDict:
+    """Return observations of random numbers [step, environment, …]."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def values(*shape: int) -> torch.Tensor:
+        return torch.randn(steps, batch, *shape, generator=generator)
+
+    touch = values(5, ITEMS, 6) * torch.tensor([0.2] * 3 + [2e-3] * 3)
+    groups = {"proprio": values(30), "goal": values(1), "tactile": touch}
+    return TensorDict(groups, batch_size=[steps, batch])
+
+
+def make_student(name: str = NETWORK, **settings: Any) -> TactilePolicy:
+    """Return an untrained student that reads them."""
+    from rsl_rl.utils import resolve_class
+
+    cfg = {
+        "class_name": "robotics_bridge.policies.student:TactilePolicy",
+        "tactile": {"name": name, "placement": "tips", "resolution": "low", **settings.pop("tactile", {})},
+        **settings,
+    }
+    kind, arguments = resolve_class(cfg)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        policy = kind(student_observations(1)[0], GROUPS, "student", 12, **arguments)
+    policy.update_normalization(student_observations(64)[0])
+    return policy

@@ -6,7 +6,6 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from brainbench.benchmarks.opening import make
 from brainbench.datasets import write_recordings
 from brainbench.datasets.sessions import make_session
 from brainbench.models.features import write_features
@@ -76,6 +75,8 @@ def write_study(tmp_path: Path) -> dict[str, str]:
 
 def write_laboratory(folder: Path) -> Path:
     """Write the same with the benchmark ``lab.toml`` that is made of them."""
+    from brainbench.benchmarks.opening import make  # an optional folder
+
     write_study(folder)
     options = ScoreOptions(
         recordings=str(folder / "data"), conditions="trials:texture", stimuli=str(folder / "eight.h5"), seed=1

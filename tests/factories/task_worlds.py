@@ -1,18 +1,21 @@
-"""A world small enough to know the right answer: touch alone tells where to go."""
+"""A world small enough to know the right answer, since touch alone tells where to go; small worlds of shipped tasks."""
 
 from __future__ import annotations
 
-from dataclasses import make_dataclass
+from dataclasses import make_dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import torch
 
+from robotics_bridge import tasks
+from robotics_bridge.envs import Env
 from robotics_bridge.envs.step import ActionMap
 from robotics_bridge.hands.observations import observation_type
 from robotics_bridge.policies.encoders.arms import EncoderConfig
 from robotics_bridge.tasks.settings import ContactModel
+from robotics_bridge.tasks.task import ObjectRandomisation
 
 
 class TouchWorld:
@@ -100,3 +103,20 @@ class Follower:
 
     def __call__(self, obs) -> torch.Tensor:
         return obs["aux_aim"] - obs["proprio"]
+
+
+def make_env(num_envs: int = 4, task: Any = "in_palm_rotate", **options: Any) -> Env:
+    """Return a few environments of a task."""
+    return tasks.make(task, num_envs=num_envs, threads=1, **options)
+
+
+def random_actions(env: Env, count: int, seed: int = 0) -> list[torch.Tensor]:
+    """Return so many actions of normal numbers."""
+    g = torch.Generator().manual_seed(seed)
+    return [torch.randn(env.num_envs, env.num_actions, generator=g) for _ in range(count)]
+
+
+def calm_task(**changes: Any) -> Any:
+    """Return the rotation task without anything random but where the object lies."""
+    still = {"actuators": None, "push": None, "object_changes": ObjectRandomisation()}
+    return replace(tasks.load("in_palm_rotate", "published"), **(still | changes))

@@ -115,3 +115,13 @@ def make_grid(envs: int = 1, half: tuple[float, float, float] = (0.01, 0.02, 0.0
     defaults = {"convection": 0.0, "radiates": False, "material": PLAIN}
     suite = SensorSuite(scene, {"grid": TemperatureGrid(link="pad", **{**defaults, **knobs})}, num_envs=envs)
     return suite, HandState.empty(envs, 3, contacts)
+
+
+def touch_face(state: HandState, half: float, envs=(0,), depth: float = 0.0, height: float = 0.03) -> None:
+    """Four contact points at the corners of a square on the upper face."""
+    corners = np.array([[x, y, height] for x in (-half, half) for y in (-half, half)])
+    env = np.repeat(envs, 4)
+    state.set_contacts(
+        env, np.tile([[0, 1]], (len(env), 1)), distance=np.full(len(env), -depth),
+        position=np.tile(corners, (len(envs), 1)), normal=np.tile([0.0, 0, 1], (len(env), 1)),
+    )  # fmt: skip

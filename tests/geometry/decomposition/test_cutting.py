@@ -21,14 +21,6 @@ def _angle_bracket(name="bracket"):
     return Mesh(flat, bottom + top + sides, name)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def own_cache(tmp_path_factory):
-    """An empty cache, also where the tests share one between runs."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("BRAINBENCH_CACHE", str(tmp_path_factory.mktemp("collision")))
-        yield
-
-
 @pytest.fixture(scope="module")
 def bracket(own_cache):
     return decompose(_angle_bracket())

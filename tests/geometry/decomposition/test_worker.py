@@ -16,14 +16,6 @@ def _angle_bracket(name="bracket"):
     return Mesh(flat, bottom + top + sides, name)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def own_cache(tmp_path_factory):
-    """An empty cache, also where the tests share one between runs."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("BRAINBENCH_CACHE", str(tmp_path_factory.mktemp("collision")))
-        yield
-
-
 def test_the_limit_of_memory_is_kept_in_words():
     with pytest.raises(DataError, match=r"'big' .*0\.1 GB"):
         decompose(_angle_bracket("big"), DecompositionSettings(memory=1e8, seed=7))

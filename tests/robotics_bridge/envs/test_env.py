@@ -15,23 +15,13 @@ from tensordict import TensorDict
 
 from brainbench.core.errors import UsageError
 from robotics_bridge import tasks
-from robotics_bridge.envs import Env
-from tests.factories.task_worlds import Follower, TouchWorld
-
-
-def _make(num_envs: int = 4, task: Any = "in_palm_rotate", **options: Any) -> Env:
-    return tasks.make(task, num_envs=num_envs, threads=1, **options)
-
-
-def _actions(env: Env, count: int, seed: int = 0) -> list[torch.Tensor]:
-    g = torch.Generator().manual_seed(seed)
-    return [torch.randn(env.num_envs, env.num_actions, generator=g) for _ in range(count)]
+from tests.factories.task_worlds import Follower, TouchWorld, make_env, random_actions
 
 
 def test_the_same_seed_gives_the_same_episode_and_another_seed_another() -> None:
     def run(seed: int) -> torch.Tensor:
-        env = _make(2, seed=seed)
-        return torch.stack([env.step(a)[0]["priv_obj_state"].clone() for a in _actions(env, 5)])
+        env = make_env(2, seed=seed)
+        return torch.stack([env.step(a)[0]["priv_obj_state"].clone() for a in random_actions(env, 5)])
 
     first = run(1)
     assert torch.equal(first, run(1))
@@ -56,7 +46,7 @@ def test_wrong_requests_say_what_is_allowed(options: dict[str, Any], message: st
 
 def test_actions_of_another_shape_are_refused() -> None:
     with pytest.raises(UsageError, match=r"\(2, 5\)"):
-        _make(2).step(torch.zeros(2, 12))
+        make_env(2).step(torch.zeros(2, 12))
 
 
 def test_what_does_not_fit_the_environments_is_refused() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +17,7 @@ from robotics_bridge.hands.observations import OBSERVATIONS, observation_type, o
 from robotics_bridge.hands.tree import cast_grid
 from robotics_bridge.tasks.settings import CONTACTS
 from robotics_bridge.tasks.task import ActuatorRandomisation, ObjectRandomisation
+from tests.factories.task_worlds import calm_task, make_env, random_actions
 
 
 @pytest.mark.parametrize(
@@ -76,25 +76,12 @@ def test_a_gpu_runs_many_environments_without_divergence(contacts: str) -> None:
     assert observations["tactile"].shape == (256, 5, 199, 6)
 
 
-def _make(num_envs: int = 4, task: Any = "in_palm_rotate", **options: Any) -> Env:
-    return tasks.make(task, num_envs=num_envs, threads=1, **options)
-
-
-def _actions(env: Env, count: int, seed: int = 0) -> list[torch.Tensor]:
-    g = torch.Generator().manual_seed(seed)
-    return [torch.randn(env.num_envs, env.num_actions, generator=g) for _ in range(count)]
-
-
-def _calm(**changes: Any) -> Any:
-    """The rotation task without anything random but where the object lies."""
-    still = {"actuators": None, "push": None, "object_changes": ObjectRandomisation()}
-    return replace(tasks.load("in_palm_rotate", "published"), **(still | changes))
-
-
 def test_an_environment_does_not_notice_how_many_others_there_are_in_its_physics() -> None:
-    env = _make(3, _calm(placement=replace(tasks.load("in_palm_rotate").placement, x=(0, 0), y=(0, 0), yaw=(0, 0))))
-    alone = _make(1, env.task)
-    action = _actions(alone, 1)[0]
+    env = make_env(
+        3, calm_task(placement=replace(tasks.load("in_palm_rotate").placement, x=(0, 0), y=(0, 0), yaw=(0, 0)))
+    )
+    alone = make_env(1, env.task)
+    action = random_actions(alone, 1)[0]
     for _ in range(10):
         env.step(action.expand(3, -1))
         alone.step(action)
@@ -105,7 +92,7 @@ def test_an_environment_does_not_notice_how_many_others_there_are_in_its_physics
 def test_torque_noise_of_one_seed_is_not_that_of_the_next_a_step_later() -> None:
     streams = {}
     for seed in (0, 1, 2):
-        actuators = (env := _make(1, seed=seed)).state.actuators
+        actuators = (env := make_env(1, seed=seed)).state.actuators
         for name in ("stiffness", "damping", "kick"):
             actuators.values[name].zero_()
         torques = []
@@ -118,7 +105,7 @@ def test_torque_noise_of_one_seed_is_not_that_of_the_next_a_step_later() -> None
 
 
 def test_drives_reach_their_targets_and_held_joints_stay() -> None:
-    env = _make(1, _calm())
+    env = make_env(1, calm_task())
     action = torch.full((1, 5), 0.5)
     for _ in range(60):
         env.step(action)
@@ -134,7 +121,7 @@ def test_drives_reach_their_targets_and_held_joints_stay() -> None:
 
 def test_changed_masses_are_what_mujoco_derives_itself() -> None:
     mujoco = mujoco_module()
-    env = _make(3, _calm(object_changes=ObjectRandomisation(friction=(0.5, 1.5), mass_offset=(0.0, 0.1))))
+    env = make_env(3, calm_task(object_changes=ObjectRandomisation(friction=(0.5, 1.5), mass_offset=(0.0, 0.1))))
     for number in range(3):
         model = env.simulation.engine.models[number]
         derived = {name: getattr(model, name).copy() for name in ("body_subtreemass", "body_invweight0", "dof_M0")}
@@ -150,7 +137,7 @@ def test_changed_masses_are_what_mujoco_derives_itself() -> None:
 
 def test_heavy_and_light_objects_fall_alike() -> None:
     aside = replace(tasks.load("in_palm_rotate").placement, height=1.0, x=(0.5, 0.5), y=(0.5, 0.5))
-    env = _make(4, _calm(placement=aside, object_changes=ObjectRandomisation(mass_offset=(0.0, 0.1))))
+    env = make_env(4, calm_task(placement=aside, object_changes=ObjectRandomisation(mass_offset=(0.0, 0.1))))
     start = env.object_pose[:, 0, 2].clone()
     for _ in range(8):
         env.step(torch.zeros(4, env.num_actions))
@@ -168,16 +155,16 @@ def test_ten_times_the_published_randomisation_is_survived() -> None:
         task, actuators=wide,
         object_changes=ObjectRandomisation(friction=(0.05, 5.5), mass_offset=(0.0, 1.0), size=(0.4, 2.5)),
     )  # fmt: skip
-    env = _make(24, task)
+    env = make_env(24, task)
     assert len(env.model.shapes) == 8 * 17
-    for a in _actions(env, 25):
+    for a in random_actions(env, 25):
         observations, reward, *_ = env.step(3 * a)
         assert reward.isfinite().all()
         assert all(value.isfinite().all() for value in observations.values())
 
 
 def test_device_memory_is_shared_with_warp() -> None:
-    env = _make(2)
+    env = make_env(2)
     assert warp().from_torch(env.state.actuators.target).ptr == env.state.actuators.target.data_ptr()
 
 
@@ -249,7 +236,7 @@ def test_grids_are_cast_by_numbers(name, value) -> None:
 
 
 def test_without_touch_no_tactile_sensor_is_built() -> None:
-    env = _make(1)
+    env = make_env(1)
     assert env.touch is None
     assert "tactile" not in env.observations
 
@@ -257,7 +244,7 @@ def test_without_touch_no_tactile_sensor_is_built() -> None:
 @pytest.mark.parametrize("kind", OBSERVATIONS)
 def test_every_observation_type_feels_the_objects_of_a_task(kind: str) -> None:
     # Blocks and cylinders share one batch: each has the other's solid as a grain.
-    env = _make(2, observe=kind, placement="tips", resolution="low")
+    env = make_env(2, observe=kind, placement="tips", resolution="low")
     observations = env.step(torch.zeros(2, env.num_actions))[0]
     assert ("tactile" in observations) == (observation_type(kind).sensor is not None)
     assert all(value.isfinite().all() for value in observations.values())
@@ -269,13 +256,13 @@ def test_touch_is_what_the_sensors_of_the_hand_read(kind: str) -> None:
 
     # Springs remember what they held, which sensors that come later cannot know.
     knobs: dict = {"total": "engine"} if kind == "force_torque" else {}
-    env = _make(2, observe=kind, placement="hand", resolution="low", knobs=knobs)
+    env = make_env(2, observe=kind, placement="hand", resolution="low", knobs=knobs)
     assert env.touch is not None
     taxels = env.hand.layout("low", "hand")
     suite = SensorSuite(env.simulation.engine.scene, sensors_for(kind, taxels, track=("object",), **knobs), num_envs=2)
     suite.reset()
     env.reset()
-    for a in _actions(env, 8):
+    for a in random_actions(env, 8):
         env.step(a)
     suite.update(env.simulation.state, 0.005)
     # The last physics step of the control step is the state that is still there, but for the refreshed poses.
@@ -292,7 +279,7 @@ def test_touch_is_what_the_sensors_of_the_hand_read(kind: str) -> None:
 
 
 def test_touch_is_felt_when_the_object_lies_on_the_palm() -> None:
-    env = _make(2, _calm(), observe="force_torque", placement="palm", resolution="med")
+    env = make_env(2, calm_task(), observe="force_torque", placement="palm", resolution="med")
     assert env.observations["tactile"].abs().sum() == 0
     for _ in range(20):
         env.step(torch.zeros(2, 5))

@@ -2,39 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
 
 from brainbench.core.rotations import to_matrices
 from robotics_bridge import tasks
-from robotics_bridge.envs import Env
 from robotics_bridge.sensors import Noise
 from robotics_bridge.tasks.goals import SteppingRotation
-from robotics_bridge.tasks.task import ObjectRandomisation
-
-
-def _make(num_envs: int = 4, task: Any = "in_palm_rotate", **options: Any) -> Env:
-    return tasks.make(task, num_envs=num_envs, threads=1, **options)
-
-
-def _actions(env: Env, count: int, seed: int = 0) -> list[torch.Tensor]:
-    g = torch.Generator().manual_seed(seed)
-    return [torch.randn(env.num_envs, env.num_actions, generator=g) for _ in range(count)]
-
-
-def _calm(**changes: Any) -> Any:
-    """The rotation task without anything random but where the object lies."""
-    still = {"actuators": None, "push": None, "object_changes": ObjectRandomisation()}
-    return replace(tasks.load("in_palm_rotate", "published"), **(still | changes))
+from tests.factories.task_worlds import calm_task, make_env, random_actions
 
 
 def test_the_goal_narrows_when_enough_episodes_succeed_and_only_while_a_teacher_learns() -> None:
     goal = SteppingRotation(start_threshold=0.4, narrowing=0.5, mastered=0.4)
-    goals = _make(4, _calm(goal=goal)).goals
+    goals = make_env(4, calm_task(goal=goal)).goals
     assert float(goals.threshold) == pytest.approx(0.1)
     goals.start_curriculum()
     assert float(goals.threshold) == pytest.approx(0.4)
@@ -51,12 +32,12 @@ def test_the_goal_narrows_when_enough_episodes_succeed_and_only_while_a_teacher_
     for _ in range(3):
         goals.count_episodes(all_of_them)
     assert float(goals.threshold) == pytest.approx(0.1)
-    assert not _make(4, _calm(goal=SteppingRotation())).goals.curriculum()
+    assert not make_env(4, calm_task(goal=SteppingRotation())).goals.curriculum()
 
 
 def test_poses_of_links_and_objects_are_quaternions_with_the_scalar_first() -> None:
-    env = _make(2, observe="bool", placement="fingers", resolution="low", link_pose=True)
-    for a in _actions(env, 3):
+    env = make_env(2, observe="bool", placement="fingers", resolution="low", link_pose=True)
+    for a in random_actions(env, 3):
         env.step(a)
     assert env.touch is not None
     pose = env.observations["link_pose"].numpy()
@@ -87,12 +68,12 @@ _LATE = {"noise": Noise(read_delay=0.021, jitter=0.01, hysteresis=0.4, walk=1e-4
 )
 def test_a_saved_state_goes_on_exactly(task, options) -> None:
     one, two = (tasks.make(task, num_envs=3, seed=seed, threads=1, **options) for seed in (2, 7))
-    for a in _actions(one, 40):
+    for a in random_actions(one, 40):
         one.step(a)
-    for a in _actions(two, 9):
+    for a in random_actions(two, 9):
         two.step(a)
     two.load_state_dict(one.state_dict())
-    for a in _actions(one, 6, seed=4):
+    for a in random_actions(one, 6, seed=4):
         first, second = one.step(a), two.step(a)
         assert torch.equal(first[1], second[1])
         for name, value in first[0].items():

@@ -13,12 +13,13 @@ import torch
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands, tasks
 from robotics_bridge.deploy.safety import SafetyLimits
-from robotics_bridge.envs import Env, step
+from robotics_bridge.envs import step
 from robotics_bridge.envs.step import step_context
 from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.registry import apply_overrides
 from robotics_bridge.tasks.scenes import build
 from robotics_bridge.tasks.task import ObjectRandomisation, Task
+from tests.factories.task_worlds import calm_task, make_env, random_actions
 
 
 def test_the_carriage_moves_no_faster_than_an_arm() -> None:
@@ -36,23 +37,8 @@ def test_the_carriage_moves_no_faster_than_an_arm() -> None:
     assert reach[0] == pytest.approx(reach[1])
 
 
-def _make(num_envs: int = 4, task: Any = "in_palm_rotate", **options: Any) -> Env:
-    return tasks.make(task, num_envs=num_envs, threads=1, **options)
-
-
-def _actions(env: Env, count: int, seed: int = 0) -> list[torch.Tensor]:
-    g = torch.Generator().manual_seed(seed)
-    return [torch.randn(env.num_envs, env.num_actions, generator=g) for _ in range(count)]
-
-
-def _calm(**changes: Any) -> Any:
-    """The rotation task without anything random but where the object lies."""
-    still = {"actuators": None, "push": None, "object_changes": ObjectRandomisation()}
-    return replace(tasks.load("in_palm_rotate", "published"), **(still | changes))
-
-
 def test_groups_have_the_sizes_of_table_4_7() -> None:
-    env = _make(3)
+    env = make_env(3)
     joints, actions, tips = 12, 5, 5
     assert env.observation_shapes == {
         "proprio": (2 * joints + actions,), "command": (1,), "goal": (1,),
@@ -66,10 +52,10 @@ def test_groups_have_the_sizes_of_table_4_7() -> None:
 
 
 def test_targets_at_rated_speed_are_those_that_deployment_sends() -> None:
-    env = _make(2, task=_calm(rated_speed=True))
+    env = make_env(2, task=calm_task(rated_speed=True))
     moved, limits = env.state.moved, SafetyLimits.of_hand(env.hand, env.state.model.moved)
     target = env.state.actuators.target
-    for action in _actions(env, 6):
+    for action in random_actions(env, 6):
         before, wanted = target[:, moved].clone().numpy(), env.action_map.targets(action.numpy())
         env.step(action)
         assert np.abs(wanted - before).max() > 0.025 * limits.speed.max()
@@ -77,12 +63,12 @@ def test_targets_at_rated_speed_are_those_that_deployment_sends() -> None:
 
 
 def test_an_environment_that_diverges_is_reset_and_counted_and_the_others_are_unharmed() -> None:
-    one, two = _make(3, seed=5), _make(3, seed=5)
+    one, two = make_env(3, seed=5), make_env(3, seed=5)
     for env in (one, two):
-        for a in _actions(env, 3):
+        for a in random_actions(env, 3):
             env.step(a)
     two.simulation.engine.data[1].qpos[:] = np.nan
-    action = _actions(one, 1, seed=9)[0]
+    action = random_actions(one, 1, seed=9)[0]
     _, _, _, _, _ = one.step(action)
     observations, reward, terminated, truncated, info = two.step(action)
     assert info["diverged"].tolist() == [False, True, False]
@@ -98,7 +84,7 @@ def test_an_environment_that_diverges_is_reset_and_counted_and_the_others_are_un
 
 
 def test_episodes_end_when_their_time_is_up_and_say_so() -> None:
-    env = _make(2, _calm(episode=0.1))
+    env = make_env(2, calm_task(episode=0.1))
     flags = [env.step(torch.zeros(2, 5)) for _ in range(4)]
     assert [bool(step[3].all()) for step in flags] == [False, False, False, True]
     assert not any(bool(step[2].any()) for step in flags)
@@ -107,7 +93,7 @@ def test_episodes_end_when_their_time_is_up_and_say_so() -> None:
 
 
 def test_actions_map_to_targets_within_the_joints_limits() -> None:
-    env = _make(1, config="published")
+    env = make_env(1, config="published")
     low, high = env.action_map.low, env.action_map.high
     targets = env.action_map.targets(np.array([1.0, 1.0, 1.0, 1.0, 1.0]))
     np.testing.assert_allclose(targets, np.clip(0.5 * (high - low), low, high))
@@ -115,8 +101,8 @@ def test_actions_map_to_targets_within_the_joints_limits() -> None:
 
 
 def test_an_action_beyond_the_limit_counts_as_the_limit_and_moves_the_same_joints() -> None:
-    far, near = _make(2, _calm(action_limit=100.0)), _make(2, _calm(action_limit=100.0))
-    free = _make(2, _calm())
+    far, near = make_env(2, calm_task(action_limit=100.0)), make_env(2, calm_task(action_limit=100.0))
+    free = make_env(2, calm_task())
     for env, size in ((far, 1e9), (near, 100.0), (free, 1e9)):
         env.reset()
         env.step(torch.full((2, env.num_actions), -size))
@@ -125,7 +111,7 @@ def test_an_action_beyond_the_limit_counts_as_the_limit_and_moves_the_same_joint
     assert torch.equal(far.simulation.qpos, near.simulation.qpos)
     assert torch.equal(far.simulation.qpos, free.simulation.qpos)
     with pytest.raises(UsageError, match=r"action_limit .* received 0"):
-        _calm(action_limit=0.0)
+        calm_task(action_limit=0.0)
 
 
 @pytest.mark.shared
@@ -179,7 +165,7 @@ def test_a_seed_fixes_what_is_drawn_once_too() -> None:
     changes = ObjectRandomisation(friction=(0.5, 2.0), mass_offset=(0.0, 0.1), each_reset=False)
     found = []
     for first in (0, 7):
-        env = _make(4, _calm(object_changes=changes), seed=first)
+        env = make_env(4, calm_task(object_changes=changes), seed=first)
         env.seed(1)
         env.reset()
         found.append(torch.stack((env.state.episode.friction, env.state.episode.mass)))
@@ -189,8 +175,8 @@ def test_a_seed_fixes_what_is_drawn_once_too() -> None:
 
 
 def test_a_mask_resets_only_its_environments() -> None:
-    env = _make(3)
-    for a in _actions(env, 4):
+    env = make_env(3)
+    for a in random_actions(env, 4):
         env.step(a)
     before, steps = env.simulation.qpos.clone(), env.episode_length_buf.clone()
     env.reset(torch.tensor([False, True, False]))
@@ -200,7 +186,7 @@ def test_a_mask_resets_only_its_environments() -> None:
 
 
 def test_objects_of_different_kinds_share_one_batch() -> None:
-    env = _make(17)
+    env = make_env(17)
     names = [env.model.shapes[number].name for number in env.simulation.shape_of]
     assert sum(name.startswith("cylinder") for name in names) == 2
     assert env.observations["aux_obj_size"].tolist() == [pytest.approx(shape.extent) for shape in env.model.shapes]

@@ -10,8 +10,6 @@ import onnx
 import pytest
 import torch
 from onnx import numpy_helper
-from rsl_rl.utils import resolve_class
-from tensordict import TensorDict
 
 from brainbench.core.errors import BrainbenchError, DataError
 from brainbench.core.files import write_json
@@ -19,7 +17,7 @@ from robotics_bridge.deploy.controller import read_deployed
 from robotics_bridge.policies.export import compare, export_policy, read_policy
 from robotics_bridge.policies.student import StepPolicy, TactilePolicy
 from tests.factories.damage import damaged
-from tests.factories.policies import contract_of, export_small
+from tests.factories.policies import GROUPS, NETWORK, contract_of, export_small, make_student, student_observations
 from tests.factories.reading_trials import time_limit
 
 SHAPES = {"proprio": (36,), "command": (1,), "tactile": (5, 5, 3)}
@@ -132,40 +130,6 @@ def test_files_that_fit_another_contract_are_refused(exported, tmp_path) -> None
             read_policy(path, SHAPES)
 
 
-NETWORK = "zhuang-intersection-ln-small"
-
-
-ITEMS = 45
-
-
-GROUPS = {"student": ["proprio", "goal", "tactile"]}
-
-
-def _observations(batch: int, steps: int = 1, seed: int = 0) -> TensorDict:
-    generator = torch.Generator().manual_seed(seed)
-
-    def values(*shape: int) -> torch.Tensor:
-        return torch.randn(steps, batch, *shape, generator=generator)
-
-    touch = values(5, ITEMS, 6) * torch.tensor([0.2] * 3 + [2e-3] * 3)
-    groups = {"proprio": values(30), "goal": values(1), "tactile": touch}
-    return TensorDict(groups, batch_size=[steps, batch])
-
-
-def _make_policy(name: str = NETWORK, **settings) -> TactilePolicy:
-    cfg = {
-        "class_name": "robotics_bridge.policies.student:TactilePolicy",
-        "tactile": {"name": name, "placement": "tips", "resolution": "low", **settings.pop("tactile", {})},
-        **settings,
-    }
-    kind, arguments = resolve_class(cfg)
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        policy = kind(_observations(1)[0], GROUPS, "student", 12, **arguments)
-    policy.update_normalization(_observations(64)[0])
-    return policy
-
-
 SLOWER = [
     pytest.param(name, marks=pytest.mark.slow)
     for name in (NETWORK, "tactile_convrnn", "tactile_canvas_cnn", "s4-small")
@@ -175,12 +139,12 @@ SLOWER = [
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["mlp", *SLOWER])
 def test_onnx_file_follows_the_policy_for_sixty_steps_with_resets(name, tmp_path) -> None:
-    policy = _make_policy(name, tactile={"time": "resampled"} if name == NETWORK else {})
+    policy = make_student(name, tactile={"time": "resampled"} if name == NETWORK else {})
     found = export_policy(policy, tmp_path / "policy", deployment={"rate": 40})
     assert found.path == tmp_path / "policy.onnx"
     assert found.difference < 1e-4
     run = read_policy(found.path, policy.shapes, threads=1)
-    other = _make_policy(name, tactile={"seed": 1} if name == NETWORK else {})
+    other = make_student(name, tactile={"seed": 1} if name == NETWORK else {})
     with torch.no_grad():
         for weight in other.mlp.parameters():
             weight.add_(0.05)
@@ -227,7 +191,7 @@ def test_an_export_that_loses_the_encoder_fails_and_leaves_no_file(wrong, messag
     with torch.random.fork_rng():
         torch.manual_seed(0)
         tactile = {"name": "mlp", "placement": "tips", "resolution": "low"}
-        policy = _Forgetful(_observations(1)[0], GROUPS, "student", 12, tactile=tactile)
+        policy = _Forgetful(student_observations(1)[0], GROUPS, "student", 12, tactile=tactile)
     policy.exported = wrong
     with pytest.raises(DataError, match=message):
         export_policy(policy, tmp_path / "policy")

@@ -6,15 +6,15 @@ import warnings
 
 import pytest
 import torch
-from rsl_rl.utils import resolve_class, split_and_pad_trajectories
-from tensordict import TensorDict
+from rsl_rl.utils import split_and_pad_trajectories
 
 from brainbench import load_model
 from brainbench.core.errors import UsageError
 from robotics_bridge.policies.encoders.arms import ARMS
 from robotics_bridge.policies.export import export_policy
-from robotics_bridge.policies.student import ActingModel, TactilePolicy
+from robotics_bridge.policies.student import ActingModel
 from robotics_bridge.policies.training.distill_config import DistillConfig
+from tests.factories.policies import NETWORK, make_student, student_observations
 
 
 def test_weights_of_rsl_rl_give_the_same_actions_without_it():
@@ -30,44 +30,10 @@ def test_weights_of_rsl_rl_give_the_same_actions_without_it():
     assert ours(observations).shape == (7, 3)
 
 
-NETWORK = "zhuang-intersection-ln-small"
-
-
-ITEMS = 45
-
-
-GROUPS = {"student": ["proprio", "goal", "tactile"]}
-
-
-def _observations(batch: int, steps: int = 1, seed: int = 0) -> TensorDict:
-    generator = torch.Generator().manual_seed(seed)
-
-    def values(*shape: int) -> torch.Tensor:
-        return torch.randn(steps, batch, *shape, generator=generator)
-
-    touch = values(5, ITEMS, 6) * torch.tensor([0.2] * 3 + [2e-3] * 3)
-    groups = {"proprio": values(30), "goal": values(1), "tactile": touch}
-    return TensorDict(groups, batch_size=[steps, batch])
-
-
-def _make_policy(name: str = NETWORK, **settings) -> TactilePolicy:
-    cfg = {
-        "class_name": "robotics_bridge.policies.student:TactilePolicy",
-        "tactile": {"name": name, "placement": "tips", "resolution": "low", **settings.pop("tactile", {})},
-        **settings,
-    }
-    kind, arguments = resolve_class(cfg)
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        policy = kind(_observations(1)[0], GROUPS, "student", 12, **arguments)
-    policy.update_normalization(_observations(64)[0])
-    return policy
-
-
 @pytest.mark.parametrize("name", [*ARMS, NETWORK, "s4-small", "zhuang-small+mamba"])
 def test_every_arm_is_a_model_of_rsl_rl_whose_memory_is_reset_row_by_row(name) -> None:
-    policy = _make_policy(name, embedder="lstm").eval()
-    obs = _observations(3, 6)
+    policy = make_student(name, embedder="lstm").eval()
+    obs = student_observations(3, 6)
     with torch.no_grad():
         whole = torch.stack([policy(obs[step]) for step in range(6)])
         assert whole.shape == (6, 3, 12)
@@ -87,8 +53,8 @@ def test_every_arm_is_a_model_of_rsl_rl_whose_memory_is_reset_row_by_row(name) -
 
 @pytest.mark.parametrize("name", ["rnn", NETWORK])
 def test_padded_sequences_of_ppo_give_the_actions_of_the_rollout(name) -> None:
-    policy = _make_policy(name, tactile={"learning": "finetuned"} if name == NETWORK else {}).eval()
-    obs = _observations(2, 6)
+    policy = make_student(name, tactile={"learning": "finetuned"} if name == NETWORK else {}).eval()
+    obs = student_observations(2, 6)
     dones = torch.zeros(6, 2, 1)
     dones[2, 0] = 1
     with torch.no_grad():
@@ -107,8 +73,8 @@ def test_padded_sequences_of_ppo_give_the_actions_of_the_rollout(name) -> None:
 
 def test_gradients_reach_a_finetuned_network_and_never_a_frozen_one() -> None:
     for learning, moves in (("finetuned", True), ("frozen", False)):
-        policy = _make_policy(tactile={"learning": learning}).train()
-        obs = _observations(2, 5)
+        policy = make_student(tactile={"learning": learning}).train()
+        obs = student_observations(2, 5)
         for step in range(5):
             actions = policy(obs[step])
         actions.pow(2).mean().backward()
@@ -120,9 +86,9 @@ def test_gradients_reach_a_finetuned_network_and_never_a_frozen_one() -> None:
 
 
 def test_kept_features_of_a_frozen_network_give_the_same_latent() -> None:
-    policy = _make_policy().eval()
+    policy = make_student().eval()
     front = policy.core.tactile.frozen_part  # type: ignore[union-attr]
-    obs, h, own = _observations(2, 5), policy.zeros(2), torch.zeros(2, front.state_size)
+    obs, h, own = student_observations(2, 5), policy.zeros(2), torch.zeros(2, front.state_size)
     for step in range(5):
         latent, h = policy.advance(obs[step], h)
         features, own = front(obs[step]["tactile"], own)
@@ -132,14 +98,14 @@ def test_kept_features_of_a_frozen_network_give_the_same_latent() -> None:
 
 @pytest.mark.slow
 def test_a_policy_that_was_sampled_in_training_is_exported_and_never_as_a_program(tmp_path) -> None:
-    policy = _make_policy("zhuang-small", distribution_cfg={"class_name": "GaussianDistribution", "init_std": 1.0})
+    policy = make_student("zhuang-small", distribution_cfg={"class_name": "GaussianDistribution", "init_std": 1.0})
     assert export_policy(policy, tmp_path / "policy").difference < 1e-4
     with pytest.raises(UsageError, match="ONNX"):
         policy.as_jit()
 
 
 def test_a_network_keeps_the_weights_that_were_scored() -> None:
-    policy = _make_policy()
+    policy = make_student()
     own = dict(load_model(NETWORK).named_parameters())
     front = policy.core.tactile.front  # type: ignore[union-attr]
     with warnings.catch_warnings():
@@ -149,8 +115,8 @@ def test_a_network_keeps_the_weights_that_were_scored() -> None:
 
 @pytest.mark.parametrize("name", [*ARMS, NETWORK])
 def test_many_steps_at_once_are_those_steps_one_by_one(name) -> None:
-    policy = _make_policy(name, embedder="lstm", tactile={"learning": "finetuned"} if name == NETWORK else {}).eval()
-    obs, ended = _observations(3, 4), torch.zeros(4, 3, dtype=torch.bool)
+    policy = make_student(name, embedder="lstm", tactile={"learning": "finetuned"} if name == NETWORK else {}).eval()
+    obs, ended = student_observations(3, 4), torch.zeros(4, 3, dtype=torch.bool)
     ended[1, 0] = ended[3, 2] = True
     with torch.no_grad():
         h, found = torch.randn(3, policy.core.state_size, generator=torch.Generator().manual_seed(1)), []
@@ -164,9 +130,9 @@ def test_many_steps_at_once_are_those_steps_one_by_one(name) -> None:
 
 
 def test_what_a_frozen_network_gave_needs_no_memory_of_touch() -> None:
-    policy = _make_policy(embedder="lstm").eval()
+    policy = make_student(embedder="lstm").eval()
     front = policy.core.tactile.frozen_part  # type: ignore[union-attr]
-    obs, own, features = _observations(2, 3), torch.zeros(2, front.state_size), []
+    obs, own, features = student_observations(2, 3), torch.zeros(2, front.state_size), []
     with torch.no_grad():
         for step in range(3):
             given, own = front(obs[step]["tactile"], own)

@@ -7,12 +7,12 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict
 
 from brainbench.core.errors import UsageError
 from robotics_bridge.policies.encoders.arms import ARMS, EchoState, EncoderConfig, FeatureNorm, RunningScale
 from robotics_bridge.policies.student import TactilePolicy
 from robotics_bridge.policies.training.distill_config import DistillConfig
+from tests.factories.policies import GROUPS, student_observations
 
 
 def test_the_same_seed_is_the_same_network_and_it_forgets_what_is_long_past() -> None:
@@ -65,23 +65,6 @@ def test_the_arm_steps_remembers_and_takes_its_draw_from_the_student(name: str) 
     torch.testing.assert_close(arm(touch[0, :2], zeros[:2])[0], arm(touch[0], zeros)[0][:2])
 
 
-ITEMS = 45
-
-
-GROUPS = {"student": ["proprio", "goal", "tactile"]}
-
-
-def _observations(batch: int, steps: int = 1, seed: int = 0) -> TensorDict:
-    generator = torch.Generator().manual_seed(seed)
-
-    def values(*shape: int) -> torch.Tensor:
-        return torch.randn(steps, batch, *shape, generator=generator)
-
-    touch = values(5, ITEMS, 6) * torch.tensor([0.2] * 3 + [2e-3] * 3)
-    groups = {"proprio": values(30), "goal": values(1), "tactile": touch}
-    return TensorDict(groups, batch_size=[steps, batch])
-
-
 def test_running_scale_counts_only_what_touches() -> None:
     scale = RunningScale(2)
     assert scale(torch.ones(1, 2)).tolist() == [[1.0, 1.0]]
@@ -101,9 +84,9 @@ def test_configurations_survive_a_file_and_name_what_is_wrong() -> None:
     with pytest.raises(UsageError, match=r"'tactile_cnn' .*'agg_bool'"):
         EncoderConfig(name="tactile_cnn", observe="agg_bool").build()
     with pytest.raises(UsageError, match=r"\[5, 199, 6\]; .*\[5, 45, 6\]"):
-        TactilePolicy(_observations(1)[0], GROUPS, "student", 12, tactile={"name": "mlp"})
+        TactilePolicy(student_observations(1)[0], GROUPS, "student", 12, tactile={"name": "mlp"})
     with pytest.raises(UsageError, match=r"tactile={'name'"):
-        TactilePolicy(_observations(1)[0], GROUPS, "student", 12)
+        TactilePolicy(student_observations(1)[0], GROUPS, "student", 12)
 
 
 def test_per_link_images_hold_each_taxel_once() -> None:
@@ -122,7 +105,7 @@ def test_convolutions_as_products_give_the_same_answers_and_gradients(name) -> N
     with torch.no_grad():
         for weight in encoder.parameters():
             weight += 0.1 * torch.randn(weight.shape, generator=torch.Generator().manual_seed(2))
-    touch = _observations(6, 3)["tactile"]
+    touch = student_observations(6, 3)["tactile"]
     ended = torch.tensor([[0, 1, 0, 0, 0, 1], [1, 0, 0, 0, 0, 0], [0, 0, 1, 0, 0, 0]], dtype=torch.bool)
     found = []
     for unroll in (super(type(encoder), encoder).unroll, encoder.unroll_as_products):  # type: ignore[operator]

@@ -19,7 +19,7 @@ from robotics_bridge.sensors.suite import SensorSuite
 from robotics_bridge.sensors.temperature.grid import TemperatureGrid
 from robotics_bridge.sensors.temperature.materials import MATERIALS, ThermalBody, ThermalMaterial, material
 from robotics_bridge.sensors.temperature.runtime import link_temperature
-from tests.factories.touch_scenes import PLAIN, make_grid
+from tests.factories.touch_scenes import PLAIN, make_grid, touch_face
 
 LIMITS = {"contact_conductance", "warm_range", "cold_range"}
 """Numbers of a grid of which infinity means none."""
@@ -31,16 +31,6 @@ NUMBERS = LIMITS | {
 def _field(suite: SensorSuite, values: np.ndarray) -> None:
     runtime = suite.runtimes[0]
     runtime.heat.temperature.assign(np.broadcast_to(values.ravel(), runtime.heat.temperature.shape).astype(np.float64))
-
-
-def _face(state: HandState, half: float, envs=(0,), depth: float = 0.0, height: float = 0.03) -> None:
-    """Four contact points at the corners of a square on the upper face."""
-    corners = np.array([[x, y, height] for x in (-half, half) for y in (-half, half)])
-    env = np.repeat(envs, 4)
-    state.set_contacts(
-        env, np.tile([[0, 1]], (len(env), 1)), distance=np.full(len(env), -depth),
-        position=np.tile(corners, (len(envs), 1)), normal=np.tile([0.0, 0, 1], (len(env), 1)),
-    )  # fmt: skip
 
 
 @pytest.mark.parametrize("mode", [1, 2, 3])
@@ -129,7 +119,7 @@ def test_touching_a_half_space_gives_the_temperatures_of_two_half_spaces(name, d
         half=(1.0, 1.0, 0.012), contacts=4, cells=(1, 1, 240), base_temperature=33.0,
         bodies={"object": ThermalBody(name, 13.0)},
     )  # fmt: skip
-    _face(state, 1.0, height=0.012)
+    touch_face(state, 1.0, height=0.012)
     steps = round(2 / dt)
     for _ in range(steps):
         suite.update(state, dt)
@@ -152,7 +142,7 @@ def test_short_touches_take_up_the_heat_of_two_half_spaces(own, other):
         suite, state = make_grid(
             half=half, contacts=4, material=own, base_temperature=33.0, bodies={"object": ThermalBody(other, 13.0)}
         )
-        _face(state, 0.2, height=0.01)
+        touch_face(state, 0.2, height=0.01)
         capacity = material(own).density * material(own).specific_heat * 8 * math.prod(half) / 8
         for step in range(1, round((1 if dt == 0.002 else 5) / dt) + 1):
             suite.update(state, dt)
@@ -166,7 +156,7 @@ def test_short_touches_take_up_the_heat_of_two_half_spaces(own, other):
 def test_a_patch_warms_every_cell_that_it_covers_and_no_other():
     pad = {"cells": (6, 6, 1), "half": (0.03, 0.03, 0.005), "bodies": {"object": ThermalBody("steel", 60.0)}}
     suite, state = make_grid(contacts=4, **pad)
-    _face(state, 0.02, height=0.005)
+    touch_face(state, 0.02, height=0.005)
     suite.update(state, 1e-3)
     warmed = suite.read_ground_truth("grid")[0, :, :, 0].numpy() - 22
     inner = warmed[1:5, 1:5]
@@ -209,7 +199,7 @@ def test_the_published_conduction_is_available_with_its_length_and_area():
         base_temperature=20.0,
         bodies={"object": ThermalBody("steel", 50.0)},
     )
-    _face(state, 0.008)
+    touch_face(state, 0.008)
     for _ in range(1000):
         suite.update(state, 1e-3)
     k = 2 * PLAIN.conductivity * 15 / (PLAIN.conductivity + 15)
@@ -243,7 +233,7 @@ def test_no_step_is_too_long_even_for_a_thin_hot_copper_pad(dt):
         half=(0.01, 0.01, 1e-4), contacts=4, cells=(4, 4, 2), material="copper", convection=500.0, radiates=True,
         bodies={"object": ThermalBody("copper", 400.0)}, ambient_temperature=-20.0,
     )  # fmt: skip
-    _face(state, 0.01, depth=1e-3, height=1e-4)
+    touch_face(state, 0.01, depth=1e-3, height=1e-4)
     for _ in range(100):
         suite.update(state, dt)
         field = suite.read_ground_truth("grid")

@@ -17,17 +17,7 @@ from robotics_bridge.sensors.temperature.grid import TemperatureGrid
 from robotics_bridge.sensors.temperature.materials import ThermalBody
 from robotics_bridge.sensors.temperature.runtime import diffusion, link_temperature, lost_contacts
 from tests.factories.sensor_episode import require_processor
-from tests.factories.touch_scenes import make_grid
-
-
-def _face(state: HandState, half: float, envs=(0,), depth: float = 0.0, height: float = 0.03) -> None:
-    """Four contact points at the corners of a square on the upper face."""
-    corners = np.array([[x, y, height] for x in (-half, half) for y in (-half, half)])
-    env = np.repeat(envs, 4)
-    state.set_contacts(
-        env, np.tile([[0, 1]], (len(env), 1)), distance=np.full(len(env), -depth),
-        position=np.tile(corners, (len(envs), 1)), normal=np.tile([0.0, 0, 1], (len(env), 1)),
-    )  # fmt: skip
+from tests.factories.touch_scenes import make_grid, touch_face
 
 
 @settings(max_examples=25)
@@ -50,7 +40,7 @@ def test_a_grid_that_touches_another_feels_its_material_and_temperature(bodies):
     }
     suite = SensorSuite(TouchScene(("world", "hot", "cold"), boxes), grids, num_envs=1)
     state = HandState.empty(1, 3, 4)
-    _face(state, 0.01, height=0.01)
+    touch_face(state, 0.01, height=0.01)
     for _ in range(200):
         suite.update(state, 0.05)
     means = [float(suite.read(name).mean()) for name in grids]
@@ -59,7 +49,7 @@ def test_a_grid_that_touches_another_feels_its_material_and_temperature(bodies):
 
 def test_environments_are_reset_and_break_alone():
     suite, state = make_grid(envs=3, contacts=12, cells=(2, 2, 2), bodies={"object": ThermalBody("steel", 60.0)})
-    _face(state, 0.008, envs=(0, 1, 2), depth=1e-3)
+    touch_face(state, 0.008, envs=(0, 1, 2), depth=1e-3)
     warm = link_temperature(suite, "grid")
     warm[2] = 22.0
     for _ in range(50):
@@ -120,7 +110,7 @@ def test_cpu_and_cuda_agree():
             TouchScene(("world", "pad", "object"), geometries), {"grid": grid}, num_envs=8, device=device
         )
         state = HandState.empty(8, 3, 32, device)
-        _face(state, 0.008, envs=tuple(range(8)), depth=1e-3)
+        touch_face(state, 0.008, envs=tuple(range(8)), depth=1e-3)
         for _ in range(100):
             suite.update(state, 0.01)
         read[device] = suite.read("grid").cpu().numpy()
