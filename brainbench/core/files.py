@@ -354,8 +354,7 @@ def state_hash(path: Path) -> str:
 
 
 @functools.lru_cache(maxsize=4096)
-def _hash_once(path: Path, *state: int) -> str:
-    del state
+def _hash_once(path: Path, *_state: int) -> str:
     return file_hash(path, length=64)
 
 

@@ -67,18 +67,18 @@ def call_apart(function: str, arguments: Sequence[Any], seconds: float) -> Any:
     with _Worker.lock:
         process = _Worker.running()
         watch = threading.Timer(seconds + PATIENCE + 3, process.kill)
-        watch.start()
+        answer = ""
         try:
-            process.stdin.write(json.dumps([function, *arguments, [seconds, seconds + PATIENCE]]) + "\n")  # type: ignore[union-attr]
-            process.stdin.flush()  # type: ignore[union-attr]
-            answer = process.stdout.readline()  # type: ignore[union-attr]
-        except OSError:
-            answer = ""
+            watch.start()
+            with contextlib.suppress(OSError):
+                process.stdin.write(json.dumps([function, *arguments, [seconds, seconds + PATIENCE]]) + "\n")  # type: ignore[union-attr]
+                process.stdin.flush()  # type: ignore[union-attr]
+                answer = process.stdout.readline()  # type: ignore[union-attr]
         finally:
             watch.cancel()
-        if not answer:
-            _Worker.process = None
-            _Worker.end(process)
+            # Also of a caller who was interrupted: the next one would take this answer for that to its own file.
+            if not answer:
+                _Worker.end(process)
         return json.loads(answer or "null")
 
 
@@ -95,14 +95,18 @@ class _Worker:
         if cls.process is None or cls._owner != os.getpid() or cls.process.poll() is not None:
             paths = os.pathsep.join(filter(None, sys.path))
             pipe = subprocess.PIPE
-            cls.process = subprocess.Popen(
+            process = subprocess.Popen(
                 [sys.executable, "-P", "-m", __name__], stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True,
                 env={**os.environ, "PYTHONPATH": paths},
             )  # fmt: skip
             # Its start on a busy machine is no fault of the file.
-            cls.process.stdout.readline()  # type: ignore[union-attr]
-            cls._owner = os.getpid()
-            atexit.register(cls.end, cls.process)
+            try:
+                process.stdout.readline()  # type: ignore[union-attr]
+            except BaseException:
+                cls.end(process)
+                raise
+            cls.process, cls._owner = process, os.getpid()
+            atexit.register(cls.end, process)
         return cls.process
 
     @staticmethod

@@ -1,6 +1,7 @@
 """Files that are read in a process of their own."""
 
 import os
+import signal
 import time
 from pathlib import Path
 
@@ -84,3 +85,36 @@ def test_what_waits_for_ever_is_ended(read, monkeypatch):
     monkeypatch.setattr(apart, "PATIENCE", 0.5)
     with pytest.raises(DataError, match="crashed or did not come back"):
         read(rest)
+
+
+@pytest.fixture
+def interrupted():
+    """Call a function that Ctrl-C interrupts after so many seconds."""
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    def call(seconds, function, *arguments):
+        signal.setitimer(signal.ITIMER_REAL, seconds)
+        with pytest.raises(KeyboardInterrupt):
+            function(*arguments)
+
+    before = signal.signal(signal.SIGALRM, stop)
+    yield call
+    signal.signal(signal.SIGALRM, before)
+
+
+def test_a_reading_that_is_interrupted_leaves_no_answer_to_the_next(read, interrupted):
+    read(whole)
+    interrupted(0.3, read, rest)
+    with pytest.raises(DataError, match="This is no track"):
+        read(refuse)
+    assert read(whole)["size"] == 3
+
+
+def test_a_process_that_is_interrupted_while_it_starts_is_started_anew(read, interrupted):
+    read(whole)
+    apart._Worker.process.kill()
+    apart._Worker.process.wait()
+    interrupted(0.05, read, whole)
+    assert read(whole)["size"] == 3
