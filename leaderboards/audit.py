@@ -22,7 +22,7 @@ from brainbench.core.files import to_plain
 from brainbench.core.identity import ScoreIdentity, plan_note
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord, Score
 from leaderboards.boards import rank
-from leaderboards.entries import TOLERANCE, moment
+from leaderboards.entries import TOLERANCE, UNTRAINED, moment
 from leaderboards.store import StoredRecord, read_records
 
 MOST_NAMED = 3  # most contradicting records that are named for one
@@ -154,31 +154,38 @@ def differences(record: ResultRecord, again: ResultRecord, *, tolerance: float =
     """Return what a repetition of a record's computation found otherwise, the inputs first.
 
     Compared are the hashes of recordings, stimuli and trained weights, and every number, layer, animal, baseline and
-    status of the scores. Numbers count as equal within ``tolerance``, distances of an RDM within this share of its
-    largest. What only says when, where and with which packages is not compared, nor the content hash of simulated
-    stimuli whose configuration is the same, nor that of weights that both drew from a seed: the last digits of both are
-    the processor's.
+    status of the scores; and whatever else a record states that pages show (:data:`STATED`), which an earlier version
+    may state less of. Numbers count as equal within ``tolerance``, distances of an RDM within this share of its
+    largest. What only says when, where, with which packages and in which words is not compared, nor the content hash of
+    simulated stimuli whose configuration is the same, nor that of weights that both drew from a seed: the last digits
+    of both are the processor's.
     """
     stated, repeated = record.score.provenance, again.score.provenance
     versions = [origin.settings.get("estimator_version") for origin in (stated, repeated)]
-    inputs: list[tuple[str, Any, Any]] = [
+    unequal: list[tuple[str, Any, Any]] = [
         ("recordings", stated.recordings_hash, repeated.recordings_hash),
         ("stimuli", stated.stimuli_hash, repeated.stimuli_hash),
         ("estimator version", versions[0], versions[1]),
     ]
-    if record.card and again.card:
-        if not record.card.objective == again.card.objective == "untrained":
-            inputs.append(("card.weights", record.card.weights, again.card.weights))
-        inputs.append(("card.parameters", record.card.parameters, again.card.parameters))
-    before, after = dict(_statements(record)), dict(_statements(again))
-    numbers = [(name, before.get(name), after.get(name)) for name in dict.fromkeys([*before, *after])]
-    unequal = [values for values in inputs if values[1] != values[2]]
-    largest: dict[str, float] = defaultdict(float)
+    if record.card and again.card and not record.card.objective == again.card.objective == UNTRAINED:
+        unequal.append(("card.weights", record.card.weights, again.card.weights))
+    unequal = [values for values in unequal if values[1] != values[2]]
+    claims = {name: value for name, value in _claims(record) if name != "card.weights"}
+    before, after, repeated_claims = dict(_statements(record)), dict(_statements(again)), dict(_claims(again))
+    limits: dict[str, float] = {}
     for name, value in before.items():
         if "_rdm[" in name and isinstance(value, (int, float)):
-            largest[name.partition("[")[0]] = max(largest[name.partition("[")[0]], abs(value))
-    limits = {name: tolerance * largest.get(name.partition("[")[0], 1.0) for name, *_ in numbers}
-    unequal += [values for values in numbers if not _equal(*values[1:], limits[values[0]])]
+            rdm = name.partition("[")[0]
+            limits[rdm] = max(limits.get(rdm, 0.0), tolerance * abs(value))
+    # A count is equal or not; some claims are large numbers with a fraction, such as an effective number of units.
+    limits |= {name: tolerance * max(1.0, abs(value)) for name, value in claims.items() if isinstance(value, float)}
+    numbers = [(name, value, repeated_claims.get(name)) for name, value in claims.items()]
+    numbers += [(name, before.get(name), after.get(name)) for name in dict.fromkeys([*before, *after])]
+    unequal += [
+        values
+        for values in numbers
+        if not _equal(*values[1:], limits.get(values[0], limits.get(values[0].partition("[")[0], tolerance)))
+    ]
     return [Difference(*values) for values in unequal]
 
 
@@ -249,16 +256,32 @@ def _statements(record: ResultRecord) -> Iterator[tuple[str, Any]]:
     scores: dict[str, Score | None] = {"score": record.score, "animal_to_animal": record.animal_to_animal}
     scores |= {f"baselines.{name}": score for name, score in record.baselines.items()}
     for where, score in scores.items():
-        for name, value in to_plain(score).items() if score is not None else ():
-            if name not in ("provenance", "reasons", "p_method", "name"):
-                yield from _leaves(f"{where}.{name}", value)
+        if score is not None:
+            yield from _leaves(where, {**to_plain(score), "provenance": {}})
+
+
+STATED = ("synthetic", "card", "benchmark", "recordings", "statistics")
+"""What pages show of a record beside its scores."""
+_WORDS = ("method", "p_method", "reasons", "reason", "citation")
+"""Entries in words, which another version words otherwise."""
+_PLACES = ("source", "title", "notes", "content_hash", "config_hash")
+"""Entries of recordings that are the user's, or are compared by the one hash that names the recordings."""
+
+
+def _claims(record: ResultRecord) -> Iterator[tuple[str, Any]]:
+    """Yield what is stated of :data:`STATED`, by its place."""
+    stated = {**to_plain(record.score.provenance), "synthetic": record.synthetic, "card": to_plain(record.card)}
+    brain = stated.get("recordings", {})
+    stated["recordings"] = {name: value for name, value in brain.items() if name not in _PLACES}
+    for name in STATED:
+        yield from ((place, value) for place, value in _leaves(name, stated.get(name)) if value is not None)
 
 
 def _leaves(where: str, value: Any) -> Iterator[tuple[str, Any]]:
     if isinstance(value, Mapping):
         layer = value.get("layer") if where.endswith("]") and "layer" in value and "subject" not in value else None
         for name, part in value.items():
-            if name != "method":
+            if name not in _WORDS:
                 yield from _leaves(f"{where}.{name}" if layer is None else f"{where}({layer}).{name}", part)
     elif isinstance(value, list):
         for index, part in enumerate(value):

@@ -8,6 +8,7 @@ import re
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
+from itertools import groupby
 from typing import Any
 
 from brainbench.core.errors import listing, visible, visible_name
@@ -194,6 +195,24 @@ def ways_to_get(record: ResultRecord) -> list[str]:
     drawn = card.seed if card.seed and card.objective in (None, "untrained") else 0
     flag, argument = (f" --weights-seed {drawn}", f", seed={drawn}") if drawn else ("", "")
     return [f"brainbench score {shlex.quote(name)}{flag}", f"brainbench.load_model({json.dumps(name)}{argument})"]
+
+
+def command_of(record: ResultRecord) -> str:
+    """Return the commands of this package that a record states, as a shell runs them; empty with any other in it.
+
+    >>> command_of(ResultRecord(Score("a", 0.5, "ok", provenance={"command": "brainbench score a $(rm -r ~)"})))
+    "brainbench score a '$(rm' -r '~)'"
+    >>> command_of(ResultRecord(Score("a", 0.5, "ok", provenance={"command": "brainbench score a; curl a.org | sh"})))
+    ''
+    """
+    reader = shlex.shlex(record.score.provenance.command, posix=True, punctuation_chars=";")
+    reader.whitespace_split, reader.commenters = True, ""
+    try:
+        parts = [[*words] for end, words in groupby(reader, ";".__eq__) if not end]
+    except ValueError:  # an open quote
+        return ""
+    commands = [shlex.join(words) for words in parts if words[0] == "brainbench"]
+    return visible("; ".join(commands)) if len(commands) == len(parts) else ""
 
 
 def training_rows(card: ModelCard) -> list[tuple[str, str]]:

@@ -171,7 +171,7 @@ def write_paper(
         "synthetic": any(board.synthetic for board in boards),
         "sections": [*_over_benchmarks(boards, path), *sections],
         "references": cited,
-        "commands": [*filter(None, dict.fromkeys(visible(item.score.provenance.command) for item in usable))],
+        "commands": [*filter(None, dict.fromkeys(map(words.command_of, usable)))],
         "bib": path.with_suffix(".bib").name,
     }
     if kind == "md":

@@ -229,7 +229,7 @@ def _score_view(record: ResultRecord) -> dict[str, Any]:
         "time_course": draw_time_course(score.provenance.statistics),
         "comparisons": comparisons(record),
         "methods": text.methods([record]),
-        "command": score.provenance.command,
+        "command": text.command_of(record),
         "card": text.card_rows(card) if card else [],
         "provenance": text.provenance_rows(score.provenance),
         "file_name": record.file_name,

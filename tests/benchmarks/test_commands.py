@@ -61,7 +61,7 @@ def test_a_stranger_gets_the_labs_score_byte_for_byte_from_one_file(run, study, 
 
     (record,) = (fresh / "theirs").glob("*.json")
     result = run("leaderboard", "verify", str(record), "--trust-code")
-    assert "give them with --recordings PATH, or the benchmark 'lab' with --benchmark FILE" in result.out + result.err
+    assert "made on the benchmark 'lab'; give it with --benchmark FILE" in result.out + result.err
     result = run("leaderboard", "verify", str(record), "--benchmark", "lab.zip", "--trust-code")
     assert "confirmed: scored again with the same result" in result.out, result.out + result.err
 

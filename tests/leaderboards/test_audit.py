@@ -179,6 +179,47 @@ def test_weights_drawn_from_a_seed_may_differ_in_the_last_digits_and_trained_one
         assert [item.what for item in differences(left, right)] == places
 
 
+CLAIMS = {
+    "synthetic": False,
+    "card.seed": 9,
+    "card.top1": 0.99,
+    "card.family": "transformer",
+    "card.graph.nodes.0.kind": "attention",
+    "score.name": "our-network",
+    "score.provenance.statistics.unique.unique": 0.99,
+    "score.provenance.statistics.unique.status": "ok",
+    "score.provenance.statistics.effective.units": 30.0,
+    "score.provenance.recordings.ledger.trials.found": 99,
+    "score.provenance.benchmark.name": "the benchmark",
+}
+"""Places of a record that pages show beside its scores, each with something else to state there."""
+
+
+@pytest.mark.parametrize("place", CLAIMS)
+def test_nothing_else_that_pages_show_is_confirmed(make_record, place):
+    statistics = {"unique": {"unique": 0.02, "status": "unreliable"}, "effective": {"units": 27.1}}
+    brain = {"source": "demo", "ledger": {"trials": {"found": 90, "read": 80}}}
+    record = _with(make_record(), statistics=statistics, recordings=brain, benchmark={"name": "lab"})
+    graph = records.ModelGraph((records.GraphNode("conv1", "encoder", "convolution"),), ())
+    record = replace(record, card=replace(record.card, graph=graph))
+    edited = to_plain(record)
+    *path, last = place.split(".")
+    inner = edited
+    for name in path:
+        inner = inner[int(name) if name.isdecimal() else name]
+    inner[last] = CLAIMS[place]
+    (difference,) = differences(records.ResultRecord.from_json(edited), record)
+    assert difference.before == CLAIMS[place]
+    assert difference.what.endswith(last)
+
+
+def test_what_a_record_does_not_state_is_no_claim_and_what_is_not_found_again_is(make_record):
+    """A record of an earlier version says less, but nothing that this version does not find."""
+    more = _with(make_record(), statistics={"unique": {"unique": 0.02}})
+    assert differences(make_record(), more) == []
+    assert [item.what for item in differences(more, make_record())] == ["statistics.unique.unique"]
+
+
 def _named(truths, **design):
     return {record.score.name: record for record in draw_board(truths, spread=0.1, **design)}
 

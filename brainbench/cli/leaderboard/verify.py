@@ -231,12 +231,10 @@ def score_again(record: ResultRecord, how: Repetition) -> ResultRecord:
     refuse_foreign_code(record, trusted=how.trust_code, stimuli=how.stimuli or how.benchmark)
     if how.benchmark is not None:
         return score_record(model, ScoreOptions.stated_in(origin.settings, benchmark=how.benchmark))
+    if name := origin.benchmark_name:
+        raise UsageError(f"The record was made on the benchmark {brief(name)}; give it with --benchmark FILE.")
     if how.recordings is None and (not isinstance(source, str) or source not in DEMOS):
-        name = origin.benchmark_name
-        advice = f", or the benchmark {brief(name)} with --benchmark FILE" if name else ""
-        raise UsageError(
-            f"The record was made with recordings {str(source)[:80]!r}; give them with --recordings PATH{advice}."
-        )
+        raise UsageError(f"The record was made with recordings {str(source)[:80]!r}; give them with --recordings PATH.")
     others = {"recordings": how.recordings or source, "match": origin.settings.get("match") or origin.pairs or None}
     options = ScoreOptions.stated_in(origin.settings, **others, **({"stimuli": how.stimuli} if how.stimuli else {}))
     return score_record(model, options)
