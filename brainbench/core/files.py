@@ -455,19 +455,37 @@ def _link(temporary: Path, path: Path) -> None:
 
 
 class _Disk(io.FileIO):
-    """A file that notes why it cannot be written and says nothing: the library prints and crashes over a full disk."""
+    """A file that notes why it cannot be written and says nothing: the library prints and crashes over a full disk.
+
+    It crashes as well where it does not find again what it wrote, so what has no place on disk is kept in memory.
+    """
 
     fault: OSError | None = None
 
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, "r+")
+        self._unwritten: list[tuple[int, bytes]] = []
+
     def write(self, data: Any) -> int:
-        rest = memoryview(data).cast("B")
-        size = len(rest)
+        place, content = self.tell(), memoryview(data).cast("B")
+        rest = content
         try:
             while len(rest) and self.fault is None:
                 rest = rest[super().write(rest) :]
         except OSError as error:
             self.fault = error
-        return size
+        if self.fault is not None:
+            self._unwritten.append((place, bytes(content)))
+        return len(content)
+
+    def readinto(self, buffer: Any) -> int:
+        place, content = self.tell(), memoryview(buffer).cast("B")
+        size = super().readinto(content) or 0
+        for start, piece in self._unwritten:
+            first, last = max(place, start), min(place + len(content), start + len(piece))
+            if first < last:
+                content[first - place : last - place] = piece[first - start : last - start]
+        return len(content) if self._unwritten else size
 
     def truncate(self, size: int | None = None) -> int:
         try:
@@ -482,7 +500,7 @@ def create_hdf5(path: str | os.PathLike[str], **options: Any) -> Iterator[h5py.F
     """Yield a new HDF5 file that replaces ``path`` when the block ends; ``options`` are those of ``h5py.File``."""
     import h5py
 
-    with atomic_path(path) as temporary, _Disk(temporary, "r+") as disk:
+    with atomic_path(path) as temporary, _Disk(temporary) as disk:
         try:
             with h5py.File(disk, "w", **options) as file:
                 yield file

@@ -310,6 +310,21 @@ def test_a_full_disk_is_told_in_our_words_alone(tmp_path, little_room, capfd, co
     assert [*tmp_path.iterdir()] == []
 
 
+def test_what_has_no_place_on_a_full_disk_is_read_back(tmp_path, little_room):
+    """The library reads again what it wrote of a file of many parts; where that was gone it crashed, or never ended."""
+    values, same = np.random.default_rng(0).normal(size=20_000), []
+
+    def write():
+        with create_hdf5(tmp_path / "a.h5") as file:
+            file["values"] = values
+            same.append(np.array_equal(file["values"][...], values))
+
+    with pytest.raises(FileWriteError, match=r"a\.h5"):
+        write()
+    assert same == [True]
+    assert [*tmp_path.iterdir()] == []
+
+
 def test_nul_in_a_text_is_refused_in_words(tmp_path):
     with pytest.raises(DataError, match="NUL"), create_hdf5(tmp_path / "a.h5") as file:
         file.create_dataset("a", data=["a\0b"], dtype=h5py.string_dtype())
