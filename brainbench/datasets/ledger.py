@@ -28,6 +28,8 @@ class LeftOut:
     number: int = 1
     lost: bool = False
     """True for what nobody asked to leave out: no selection, no window, no mark in the file itself."""
+    rows: tuple[int, ...] = field(default=(), repr=False)
+    """Rows of their table, where a rule left them out."""
 
 
 @dataclass
@@ -54,11 +56,11 @@ class Ledger:
         self.totals[kind] += number
         self.read[kind] += read
 
-    def leave(self, kind: str, reason: str, number: int = 1, *, lost: bool = False) -> None:
+    def leave(self, kind: str, reason: str, number: int = 1, *, lost: bool = False, rows: tuple[int, ...] = ()) -> None:
         """Note that so many were not read, and why. Raises DataError for a lost one if the ledger is strict."""
         if lost and self.strict:
             raise DataError(reason)
-        self.left.append(LeftOut(kind, reason, number, lost))
+        self.left.append(LeftOut(kind, reason, number, lost, rows))
 
     def note(self, text: str) -> None:
         """Add a note, once."""
@@ -66,7 +68,8 @@ class Ledger:
 
     def apply(self, keep: NDArray[np.bool_], passes: Any, kind: str, rule: str) -> NDArray[np.bool_]:
         """Return which rows [n] of one kind remain, and enter those that only now fell out by a rule."""
-        self.leave(kind, rule, int(np.sum(keep & ~passes)))
+        rows = tuple(np.flatnonzero(keep & ~passes).tolist())
+        self.leave(kind, rule, len(rows), rows=rows)
         return keep & passes
 
     @property
@@ -89,7 +92,7 @@ class Ledger:
             for key, values in getattr(part, name).items():
                 getattr(self, name).setdefault(key, set()).update(values)
         for entry in part.left:
-            self.leave(entry.kind, entry.reason, entry.number, lost=entry.lost)
+            self.leave(entry.kind, entry.reason, entry.number, lost=entry.lost, rows=entry.rows)
         return self
 
     def close(self) -> list[str]:

@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
+import numpy as np
+
 from brainbench.core.contracts import check_recordings
 from brainbench.core.errors import DataError, UsageError, check_each, listing, unknown_name
 from brainbench.core.progress import Progress, track
@@ -224,7 +226,7 @@ class _Reader:
             if name not in read:
                 chosen = reason.endswith("chosen animals")
                 ledger.leave("animals", reason or f"{name}: no trial is left", lost=not chosen)
-        labels = frozenset[str]().union(*(part.found_labels for part in parts))
+        labels = {*np.concatenate([part.table_labels for part in parts]).tolist()} - {""}
         present = labels & {*joined["stimulus"].values.tolist()}
         ledger.find("labels", len(labels), len(present))
         for label in sorted(labels - present):

@@ -121,8 +121,12 @@ class SessionCounts:
     """Balance of the file: tables, trials, units, spikes."""
     measure: str = "spikes"
     """What the responses are: spikes, or name and NWB type of a signal."""
-    found_labels: frozenset[str] = frozenset()
-    """Labels of all rows of the table, before any rule."""
+    rows: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    """[R] row of each trial in its table."""
+    starts: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    """Start of every row of the table, before any rule, s."""
+    table_labels: NDArray[np.str_] = field(default_factory=lambda: np.zeros(0, "U1"))
+    """Label of every row of the table; "" for none."""
 
 
 def count_session(
@@ -190,7 +194,9 @@ def count_session(
         columns={name: _unit_column(source.units, name, kind, units, ledger.notes) for name, kind in columns},
         covariates=trial_covariates(session, table, rows, edges[rows]),
         measure=measure,
-        found_labels=frozenset(labels.tolist()) - {""},
+        rows=rows,
+        starts=start,
+        table_labels=labels,
         ledger=ledger,
     )
 

@@ -6,7 +6,7 @@ Units differ between sessions, so every session stands for itself.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
@@ -480,6 +480,13 @@ def _joined(first: SessionCounts, second: SessionCounts, same: dict[int, int]) -
         duration[target, : second.duration.shape[1]] = second.duration[row]
     edges = np.concatenate([first.edges, second.edges[more]])
 
+    # Each file may list trials that the other lacks; rows without a start are one row in both.
+    starts = [np.where(np.isnan(part.starts), -1e9, part.starts) for part in (first, second)]
+    shared = _coincident(starts[1], second.table_labels, starts[0], first.table_labels, 1e-3)
+    only = [row for row in range(len(second.starts)) if row not in shared]
+    row_of = shared | {row: len(first.starts) + index for index, row in enumerate(only)}
+    table_rows = np.append(first.rows, [row_of[int(second.rows[row])] for row in more]).astype(np.int64)
+
     def both(name: str) -> tuple[Any, ...]:
         return (*getattr(first, name), *(getattr(second, name)[row] for row in more))
 
@@ -504,20 +511,27 @@ def _joined(first: SessionCounts, second: SessionCounts, same: dict[int, int]) -
         duration=duration[order],
         columns={name: np.concatenate([first.columns[name], second.columns[name]]) for name in first.columns},
         covariates={name: values[order] for name, values in covariates.items()},
-        ledger=_joined_ledger(first.ledger, second.ledger, trials, len(more)),
-        found_labels=first.found_labels | second.found_labels,
+        rows=table_rows[order],
+        starts=np.append(first.starts, second.starts[only]),
+        table_labels=np.append(first.table_labels, second.table_labels[only]),
+        ledger=_joined_ledger(first.ledger, second.ledger, table_rows, row_of),
     )
 
 
-def _joined_ledger(first: Ledger, second: Ledger, trials: int, more: int) -> Ledger:
-    """Return the balance of both: all of either, but of the trials, which both have, those that neither took."""
-    ledger = Ledger().add(first).add(second)
-    ledger.totals["trials"], ledger.read["trials"] = first.totals["trials"], trials
-    left = [entry for entry in ledger.left if entry.kind != "trials"]
-    # Trials that only the second part kept were removed from the first by its last rules.
-    for entry in reversed([entry for entry in first.left if entry.kind == "trials"]):
-        back = min(more, entry.number)
-        left.insert(0, replace(entry, number=entry.number - back))
-        more -= back
-    ledger.left = left
+def _joined_ledger(first: Ledger, second: Ledger, read: NDArray[np.int64], row_of: Mapping[int, int]) -> Ledger:
+    """Return the balance of both: all of either, but of the trials each row of a table that holds both ones' rows.
+
+    ``read`` are the rows of the trials there, ``row_of`` those of the second one's rows.
+    """
+    ledger, begin = Ledger().add(first).add(second), first.totals["trials"]
+    ledger.totals["trials"], ledger.read["trials"] = len({*range(begin), *row_of.values()}), len(read)
+    ledger.left = [entry for entry in ledger.left if entry.kind != "trials"]
+    left_out = {*range(ledger.totals["trials"])} - {*read.tolist()}
+    # A trial that neither took is left out for the first one's reason.
+    for part, rows in ((first, range(begin)), (second, [row_of[row] for row in range(second.totals["trials"])])):
+        for entry in part.left:
+            if entry.kind == "trials":
+                places = tuple(sorted({rows[row] for row in entry.rows} & left_out))
+                ledger.left.append(replace(entry, number=len(places), rows=places))
+        left_out -= {*rows}
     return ledger

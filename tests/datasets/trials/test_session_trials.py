@@ -208,6 +208,22 @@ def test_a_probe_that_stops_early_leaves_gaps_and_removes_no_trials(tmp_path):
     assert not any("balance" in doubt for doubt in opened.attrs["doubts"])
 
 
+def test_probes_that_list_other_trials_are_joined_and_each_trial_is_found_once(tmp_path):
+    _, probes = halves()
+    table = probes[0].tables["trials"].data
+    table |= {"outcome": np.array(["error", *["correct"] * 10, "error"])}
+    for probe, rows in zip(probes, (slice(0, 9), slice(2, 12)), strict=True):
+        part = {name: values[rows] for name, values in table.items()}
+        spikes = probe.units.rows("spike_times")
+        write_recordings(tmp_path / f"{len(spikes)}.h5", make_session("mouse", "1", spikes, {"trials": part}))
+    opened = open_recordings(tmp_path, conditions="trials:stimulus", select="outcome=correct")
+    balance = opened.attrs["ledger"]["trials"]
+    assert (balance["found"], balance["read"]) == (12, 10)
+    assert balance["left_out"] == [{"reason": "outcome=correct", "number": 2, "lost": False}]
+    assert opened["counts"].isnull().all(axis=1).sum(axis=1).values.tolist() == [4, *[0] * 7, 2, 2]
+    assert not any("balance" in doubt for doubt in opened.attrs["doubts"])
+
+
 @pytest.mark.parametrize("shift", [0.0, 100.0])
 @pytest.mark.parametrize("units", [6, 4])
 def test_the_same_spikes_under_another_name_are_refused(tmp_path, shift, units):
