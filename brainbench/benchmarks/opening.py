@@ -26,7 +26,6 @@ from brainbench.core.errors import (
     check_each,
     listing,
     nearest,
-    repeats,
     unknown_name,
     visible,
 )
@@ -295,8 +294,6 @@ def _unpacked(path: Path) -> tuple[Benchmark, Path]:
 def _definition(archive: zipfile.ZipFile, where: str) -> Benchmark:
     """Return the definition in an archive, whose members are the files that it lists and no others."""
     members = {entry.filename: entry for entry in archive.infolist()}
-    if twice := repeats(entry.filename for entry in archive.infolist()):
-        raise DataError(f"{where} holds {listing(twice, limit=3)} twice; pack it again.")
     if links := [name for name, entry in members.items() if stat.S_ISLNK(entry.external_attr >> 16)]:
         raise DataError(f"{where} holds a link, {brief(links[0])}; it holds files alone: pack it again.")
     if DEFINITION not in members:

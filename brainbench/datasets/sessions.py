@@ -124,7 +124,9 @@ class SessionTable:
         """Read one numeric column [rows] in seconds."""
         values = self.column(name)
         if values.dtype.kind == "U":
-            raise DataError(f"Column {name!r} of {self.label} holds text ({values[0]!r}); expected times in seconds.")
+            raise DataError(
+                f"Column {name!r} of {self.label} holds text ({brief(str(values[0]))}); expected times in seconds."
+            )
         return self._exact(name, values)
 
     def _exact(self, name: str, values: NDArray[Any]) -> NDArray[np.float64]:

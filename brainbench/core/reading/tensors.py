@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import DataError, brief, listing
+from brainbench.core.errors import DataError, brief, listing, repeats
 from brainbench.core.reading.hdf5_worker import MOST_EXPANSION, MOST_MEMORY
 from brainbench.core.reading.regular import check_file, readable
 
@@ -56,8 +56,10 @@ def _array(stored: Mapping[str, Any], key: str, name: str) -> NDArray[np.generic
 
 
 def check_archive(archive: zipfile.ZipFile, path: str | os.PathLike[str], kind: str) -> None:
-    """Refuse what is encrypted, and what unpacks to far more than is stored."""
+    """Refuse what is encrypted, what has a name twice, and what unpacks to far more than is stored."""
     members, name = archive.infolist(), brief(os.fspath(path))
+    if twice := repeats(item.filename for item in members):
+        raise DataError(f"{name} holds {listing(twice, limit=3)} twice, of which one would be read; write it again.")
     if locked := [item.filename for item in members if item.flag_bits & 1]:
         raise DataError(f"{name} is encrypted ({listing(locked, limit=3)}); save it without a password.")
     unpacked = sum(item.file_size for item in members)

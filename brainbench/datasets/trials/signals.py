@@ -78,6 +78,8 @@ class Samples:
         cells = replace(series.cells, where=name)
         if len(cells) != (shape[-1] if len(shape) > 1 else 1) or len(shape) > 2 + bool(series.table):
             raise DataError(f"{name} has the shape {shape}, not [frame, unit], and {len(cells)} units are named.")
+        if series.data.dtype.kind not in "biuf" or 0 in shape:
+            raise DataError(f"{name} has the shape {shape} of {series.data.dtype}; samples are real numbers, one each.")
         if not series.table:
             samples = cls(cells, series, series.times(), name, band=window.band)
             if samples.band is not None and not 2 * samples.band[1] * samples.step < 1:
@@ -190,8 +192,16 @@ class Samples:
         imaged = self.band is None and self.series.unit != "spikes"
         if doubt := fading(rates, BLEACHING if imaged else "as where electrodes or arousal change"):
             to.doubts.append(f"{self.name}: {doubt}")
+        length, trials = float(np.ptp(self.times)), float(np.ptp(bounds)) if len(bounds) else 0.0
+        if self.starts is None and length > MOST_BESIDE * trials > 0:
+            to.doubts.append(
+                f"{self.name} runs for {length:,.0f} s and its trials for {trials:,.0f}, so its times may be numbers "
+                "of frames, or another unit than seconds"
+            )
 
 
+MOST_BESIDE = 5.0
+"""Time of a recording, in that of its trials, from which it is doubted that both are in seconds."""
 LOST = 0.1
 """Share of a window without frames up to which its mean stands for all of it."""
 

@@ -73,3 +73,11 @@ def test_pickles_encryption_and_false_headers_are_refused(tmp_path):
         np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": (2**40,)})
     with pytest.raises(DataError, match="one"):
         read_npz(path)
+
+
+def test_an_array_that_stands_twice_is_refused(tmp_path):
+    np.savez(tmp_path / "a.npz", a=np.arange(3))
+    with zipfile.ZipFile(tmp_path / "a.npz", "a") as archive, pytest.warns(UserWarning, match="Duplicate"):
+        archive.writestr("a.npy", archive.read("a.npy"))
+    with pytest.raises(DataError, match=r"holds 'a.npy' twice, of which one would be read"):
+        read_npz(tmp_path / "a.npz")

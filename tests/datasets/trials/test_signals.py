@@ -50,6 +50,23 @@ def test_signals_of_other_than_frames_and_units_are_refused(tmp_path):
         open_recordings(path, conditions="trials:texture")
 
 
+@pytest.mark.parametrize("data", [np.zeros((70, 2), "c8"), np.full((70, 2), b"x"), np.zeros((70, 0)), np.zeros((0, 2))])
+def test_samples_are_real_numbers_and_there_are_some(tmp_path, data):
+    """Of complex numbers the real part was read."""
+    with pytest.raises(DataError, match="samples are real numbers, one each"):
+        open_recordings(imaged(tmp_path / "a.nwb", data), conditions="trials:texture")
+
+
+def test_numbers_of_frames_in_place_of_seconds_are_doubted(tmp_path):
+    """An unknown rate is written as 1, so the first frames, one a second, pass for those of all trials."""
+    data = np.random.default_rng(0).normal(size=(700, 3))
+    for rate, doubted in ((1.0, True), (100.0, False)):
+        path = imaged(tmp_path / f"{rate}.nwb", data, rate=rate)
+        opened = open_recordings(path, conditions="trials:texture", window="start..+1")
+        doubts = opened.attrs["doubts"]
+        assert any("runs for 699 s and its trials for 6, so its times" in doubt for doubt in doubts) is doubted
+
+
 def test_bins_timestamps_and_chosen_cells(tmp_path):
     data = np.random.default_rng(0).normal(size=(70, 3))
     path = imaged(tmp_path / "a.nwb", data, stamps=0.001 + np.arange(70) / 10)
