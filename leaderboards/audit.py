@@ -162,31 +162,25 @@ def differences(record: ResultRecord, again: ResultRecord, *, tolerance: float =
     """
     stated, repeated = record.score.provenance, again.score.provenance
     versions = [origin.settings.get("estimator_version") for origin in (stated, repeated)]
-    unequal: list[tuple[str, Any, Any]] = [
+    pairs: list[tuple[str, Any, Any]] = [
         ("recordings", stated.recordings_hash, repeated.recordings_hash),
         ("stimuli", stated.stimuli_hash, repeated.stimuli_hash),
         ("estimator version", versions[0], versions[1]),
     ]
     if record.card and again.card and not record.card.objective == again.card.objective == UNTRAINED:
-        unequal.append(("card.weights", record.card.weights, again.card.weights))
-    unequal = [values for values in unequal if values[1] != values[2]]
-    claims = {name: value for name, value in _claims(record) if name != "card.weights"}
-    before, after, repeated_claims = dict(_statements(record)), dict(_statements(again)), dict(_claims(again))
-    limits: dict[str, float] = {}
+        pairs.append(("card.weights", record.card.weights, again.card.weights))
+    claims, claims_again = dict(_claims(record)), dict(_claims(again))
+    before, after = dict(_statements(record)), dict(_statements(again))
+    pairs += [(name, value, claims_again.get(name)) for name, value in claims.items()]
+    pairs += [(name, before.get(name), after.get(name)) for name in dict.fromkeys([*before, *after])]
+    # A count is equal or not; some claims are large numbers with a fraction, such as an effective number of units.
+    limits = {name: tolerance * max(1.0, abs(value)) for name, value in claims.items() if isinstance(value, float)}
     for name, value in before.items():
         if "_rdm[" in name and isinstance(value, (int, float)):
             rdm = name.partition("[")[0]
             limits[rdm] = max(limits.get(rdm, 0.0), tolerance * abs(value))
-    # A count is equal or not; some claims are large numbers with a fraction, such as an effective number of units.
-    limits |= {name: tolerance * max(1.0, abs(value)) for name, value in claims.items() if isinstance(value, float)}
-    numbers = [(name, value, repeated_claims.get(name)) for name, value in claims.items()]
-    numbers += [(name, before.get(name), after.get(name)) for name in dict.fromkeys([*before, *after])]
-    unequal += [
-        values
-        for values in numbers
-        if not _equal(*values[1:], limits.get(values[0], limits.get(values[0].partition("[")[0], tolerance)))
-    ]
-    return [Difference(*values) for values in unequal]
+    near = [limits.get(name, limits.get(name.partition("[")[0], tolerance)) for name, *_ in pairs]
+    return [Difference(*pair) for pair, limit in zip(pairs, near, strict=True) if not _equal(*pair[1:], limit)]
 
 
 def open_build(*sources: str | os.PathLike[str]) -> list[StoredRecord]:
@@ -262,17 +256,16 @@ def _statements(record: ResultRecord) -> Iterator[tuple[str, Any]]:
 
 STATED = ("synthetic", "card", "benchmark", "recordings", "statistics")
 """What pages show of a record beside its scores."""
-_WORDS = ("method", "p_method", "reasons", "reason", "citation")
-"""Entries in words, which another version words otherwise."""
-_PLACES = ("source", "title", "notes", "content_hash", "config_hash")
-"""Entries of recordings that are the user's, or are compared by the one hash that names the recordings."""
+_WORDS = ("method", "p_method", "reasons", "reason", "citation")  # another version words them otherwise
+_APART = {"card": ("weights",), "recordings": ("source", "title", "notes", "content_hash", "config_hash")}
+"""Entries that are the user's, or are compared by themselves."""
 
 
 def _claims(record: ResultRecord) -> Iterator[tuple[str, Any]]:
     """Yield what is stated of :data:`STATED`, by its place."""
     stated = {**to_plain(record.score.provenance), "synthetic": record.synthetic, "card": to_plain(record.card)}
-    brain = stated.get("recordings", {})
-    stated["recordings"] = {name: value for name, value in brain.items() if name not in _PLACES}
+    for name, apart in _APART.items():
+        stated[name] = {key: value for key, value in (stated.get(name) or {}).items() if key not in apart}
     for name in STATED:
         yield from ((place, value) for place, value in _leaves(name, stated.get(name)) if value is not None)
 

@@ -10,7 +10,7 @@ import hashlib
 import os
 import secrets
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 
@@ -34,7 +34,7 @@ class Commitment(msgspec.Struct, frozen=True, rename={"public": "kept"}):
     """Number that is public; files call it ``kept``."""
     recordings: str
     """Content hash of the recordings before they were split."""
-    digest: str
+    digest: Annotated[str, msgspec.Meta(min_length=64, max_length=64)]
     """SHA-256 of salt and file."""
 
     @classmethod

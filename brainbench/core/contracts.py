@@ -306,6 +306,8 @@ def join_labels(
         )
     if twice := repeats(pairs.values()):
         raise UsageError(f"Two recording labels are paired with the stimulus {twice[0]!r}; pairs must be one to one.")
+    if len(pairs) < 2:
+        raise UsageError(f"The match drops all but {len(pairs)} of {len(vocabulary)} labels; comparing needs two.")
     return {label: str(partner) for label, partner in pairs.items()}
 
 

@@ -461,22 +461,18 @@ class _Disk(io.FileIO):
     """
 
     fault: OSError | None = None
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(path, "r+")
-        self._unwritten: list[tuple[int, bytes]] = []
+    _unwritten: tuple[tuple[int, bytes], ...] = ()
 
     def write(self, data: Any) -> int:
-        place, content = self.tell(), memoryview(data).cast("B")
-        rest = content
+        rest = memoryview(data).cast("B")
+        size = len(rest)
         try:
             while len(rest) and self.fault is None:
                 rest = rest[super().write(rest) :]
         except OSError as error:
             self.fault = error
-        if self.fault is not None:
-            self._unwritten.append((place, bytes(content)))
-        return len(content)
+        self._unwritten += ((self.tell(), bytes(rest)),) if len(rest) else ()
+        return size
 
     def readinto(self, buffer: Any) -> int:
         place, content = self.tell(), memoryview(buffer).cast("B")
@@ -485,7 +481,7 @@ class _Disk(io.FileIO):
             first, last = max(place, start), min(place + len(content), start + len(piece))
             if first < last:
                 content[first - place : last - place] = piece[first - start : last - start]
-        return len(content) if self._unwritten else size
+        return size if self.fault is None else len(content)
 
     def truncate(self, size: int | None = None) -> int:
         try:
@@ -500,7 +496,7 @@ def create_hdf5(path: str | os.PathLike[str], **options: Any) -> Iterator[h5py.F
     """Yield a new HDF5 file that replaces ``path`` when the block ends; ``options`` are those of ``h5py.File``."""
     import h5py
 
-    with atomic_path(path) as temporary, _Disk(temporary) as disk:
+    with atomic_path(path) as temporary, _Disk(temporary, "r+") as disk:
         try:
             with h5py.File(disk, "w", **options) as file:
                 yield file

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ class LeftOut:
     number: int = 1
     lost: bool = False
     """True for what nobody asked to leave out: no selection, no window, no mark in the file itself."""
-    rows: tuple[int, ...] = field(default=(), repr=False)
+    rows: Sequence[int] = field(default=(), repr=False)
     """Rows of their table, where a rule left them out."""
 
 
@@ -68,7 +68,7 @@ class Ledger:
 
     def apply(self, keep: NDArray[np.bool_], passes: Any, kind: str, rule: str) -> NDArray[np.bool_]:
         """Return which rows [n] of one kind remain, and enter those that only now fell out by a rule."""
-        rows = tuple(np.flatnonzero(keep & ~passes).tolist())
+        rows = np.flatnonzero(keep & ~passes).tolist()
         self.leave(kind, rule, len(rows), rows=rows)
         return keep & passes
 

@@ -45,7 +45,7 @@ def _benchmark(**changes) -> Benchmark:
         "match": {'the "left" one': "concave", "dröpped": ""},
         "files": {"data/a b.h5": DIGEST},
         "ceiling": Ceilings(4, 8, 0.9, None, 0.5, 0.7),
-        "held_out": Commitment("animals", 2, 4, "abc", "def"),
+        "held_out": Commitment("animals", 2, 4, "abc", DIGEST),
         "citation": "Doé J. (2026)",
     }
     return Benchmark(**(stated | changes))

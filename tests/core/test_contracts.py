@@ -130,6 +130,11 @@ def test_a_wrong_match_is_refused(match: dict[str, str], message: str):
         join_labels(("a", "face"), ("a", "cube"), match)
 
 
+def test_a_match_leaves_two_labels_at_least():
+    with pytest.raises(UsageError, match="drops all but 1 of 2 labels; comparing needs two"):
+        join_labels(("a", "b"), ("a", "b"), {"a": None})
+
+
 def test_match_files_of_three_kinds_say_the_same(tmp_path: Path):
     expected = {"1": "face", "2": None}
     (tmp_path / "m.json").write_text(json.dumps(expected))
@@ -182,7 +187,7 @@ def test_a_value_has_one_label_whatever_form_it_is_stored_in(values, labels):
 
 def test_stimuli_that_were_not_recorded_are_left_out_and_forms_of_a_number_are_equal():
     assert join_labels(("15", "a"), ("a", "15.0", "b"), None) == {"15": "15.0", "a": "a"}
-    assert join_labels(("1.1",), ("1.1", "1.10"), None) == {"1.1": "1.1"}
+    assert join_labels(("1.1", "2"), ("1.1", "1.10", "2"), None) == {"1.1": "1.1", "2": "2"}
 
 
 @pytest.mark.parametrize(

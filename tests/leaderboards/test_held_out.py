@@ -57,3 +57,10 @@ def test_a_file_that_is_no_commitment_is_refused(secret: Path, tmp_path: Path, c
     (tmp_path / "held-out.json").write_text(json.dumps(_commit(secret).plain | change))
     with pytest.raises(DataError, match=next(iter(change))):
         Commitment.read(tmp_path / "held-out.json")
+
+
+def test_a_commitment_that_nothing_can_fit_is_refused(secret: Path, tmp_path: Path) -> None:
+    path = tmp_path / "held-out.json"
+    path.write_text(json.dumps({**_commit(secret).plain, "digest": "xyz"}))
+    with pytest.raises(DataError, match="digest is 'xyz'; expected text of length >= 64"):
+        Commitment.read(path)

@@ -485,7 +485,7 @@ def _joined(first: SessionCounts, second: SessionCounts, same: dict[int, int]) -
     shared = _coincident(starts[1], second.table_labels, starts[0], first.table_labels, 1e-3)
     only = [row for row in range(len(second.starts)) if row not in shared]
     row_of = shared | {row: len(first.starts) + index for index, row in enumerate(only)}
-    table_rows = np.append(first.rows, [row_of[int(second.rows[row])] for row in more]).astype(np.int64)
+    rows_in_table = np.array([*first.rows, *(row_of[int(second.rows[row])] for row in more)], dtype=np.int64)
 
     def both(name: str) -> tuple[Any, ...]:
         return (*getattr(first, name), *(getattr(second, name)[row] for row in more))
@@ -511,10 +511,10 @@ def _joined(first: SessionCounts, second: SessionCounts, same: dict[int, int]) -
         duration=duration[order],
         columns={name: np.concatenate([first.columns[name], second.columns[name]]) for name in first.columns},
         covariates={name: values[order] for name, values in covariates.items()},
-        rows=table_rows[order],
+        rows=rows_in_table[order],
         starts=np.append(first.starts, second.starts[only]),
         table_labels=np.append(first.table_labels, second.table_labels[only]),
-        ledger=_joined_ledger(first.ledger, second.ledger, table_rows, row_of),
+        ledger=_joined_ledger(first.ledger, second.ledger, rows_in_table, row_of),
     )
 
 
@@ -531,7 +531,7 @@ def _joined_ledger(first: Ledger, second: Ledger, read: NDArray[np.int64], row_o
     for part, rows in ((first, range(begin)), (second, [row_of[row] for row in range(second.totals["trials"])])):
         for entry in part.left:
             if entry.kind == "trials":
-                places = tuple(sorted({rows[row] for row in entry.rows} & left_out))
+                places = [*{rows[row] for row in entry.rows} & left_out]
                 ledger.left.append(replace(entry, number=len(places), rows=places))
         left_out -= {*rows}
     return ledger

@@ -192,16 +192,12 @@ class Samples:
         imaged = self.band is None and self.series.unit != "spikes"
         if doubt := fading(rates, BLEACHING if imaged else "as where electrodes or arousal change"):
             to.doubts.append(f"{self.name}: {doubt}")
-        length, trials = float(np.ptp(self.times)), float(np.ptp(bounds)) if len(bounds) else 0.0
-        if self.starts is None and length > MOST_BESIDE * trials > 0:
-            to.doubts.append(
-                f"{self.name} runs for {length:,.0f} s and its trials for {trials:,.0f}, so its times may be numbers "
-                "of frames, or another unit than seconds"
-            )
+        if self.starts is None and len(bounds) and np.ptp(self.times) > MOST_BESIDE * np.ptp(bounds):
+            times = f"{np.ptp(self.times):,.0f} s and its trials for {np.ptp(bounds):,.0f}"
+            to.doubts.append(f"{self.name} runs for {times}, so its times may be numbers of frames, or no seconds")
 
 
-MOST_BESIDE = 5.0
-"""Time of a recording, in that of its trials, from which it is doubted that both are in seconds."""
+MOST_BESIDE = 5.0  # length of a recording, in that of its trials, from which the unit of its times is doubted
 LOST = 0.1
 """Share of a window without frames up to which its mean stands for all of it."""
 
