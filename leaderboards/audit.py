@@ -257,7 +257,7 @@ def _statements(record: ResultRecord) -> Iterator[tuple[str, Any]]:
 STATED = ("synthetic", "card", "benchmark", "recordings", "statistics")
 """What pages show of a record beside its scores."""
 _WORDS = ("method", "p_method", "reasons", "reason", "citation")  # another version words them otherwise
-_APART = {"card": ("weights",), "recordings": ("source", "title", "notes", "content_hash", "config_hash")}
+_APART = {"card": ("weights",), "recordings": ("source", "title", "skipped", "content_hash", "config_hash")}
 """Entries that are the user's, or are compared by themselves."""
 
 

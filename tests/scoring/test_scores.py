@@ -174,6 +174,17 @@ def test_a_record_with_a_dropped_label_is_repeated_without_it(truth: Path, folde
     assert differences(record, again) == []
 
 
+@pytest.mark.parametrize("more", [{"by": "area"}, {"by": "area=S1"}, {"explain": True}])
+def test_what_a_record_states_beside_its_score_is_repeated_too(
+    truth: Path, recordings: xr.Dataset, tmp_path: Path, more: dict[str, object]
+):
+    area = np.where(np.arange(recordings.sizes["unit"]) % 2, "S1", "M1")
+    path = str(write_recordings(tmp_path / "counts.h5", recordings.assign_coords(area=("unit", area))))
+    record = score_record(str(truth), recordings=path, **more)
+    assert {"groups", "estimator_walk"} & {*record.score.provenance.statistics}
+    assert differences(record, score_again(record, Repetition(path, trust_code=True))) == []
+
+
 @pytest.mark.parametrize(
     "choice", [{"select": "stimulus=a|b"}, {"window": "start..+0.1"}, {"conditions": "trials:stimulus"}, {"bin": 0.1}]
 )

@@ -10,7 +10,7 @@ import math
 import secrets
 import subprocess
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Annotated, Any
@@ -229,15 +229,31 @@ def score_again(record: ResultRecord, how: Repetition) -> ResultRecord:
             "record of an earlier layout); score the model again."
         )
     refuse_foreign_code(record, trusted=how.trust_code, stimuli=how.stimuli or how.benchmark)
+    more = _additions(origin.statistics)
     if how.benchmark is not None:
-        return score_record(model, ScoreOptions.stated_in(origin.settings, benchmark=how.benchmark))
+        return score_record(model, ScoreOptions.stated_in(origin.settings, benchmark=how.benchmark, **more))
     if name := origin.benchmark_name:
         raise UsageError(f"The record was made on the benchmark {brief(name)}; give it with --benchmark FILE.")
     if how.recordings is None and (not isinstance(source, str) or source not in DEMOS):
         raise UsageError(f"The record was made with recordings {str(source)[:80]!r}; give them with --recordings PATH.")
-    others = {"recordings": how.recordings or source, "match": origin.settings.get("match") or origin.pairs or None}
+    others = {
+        "recordings": how.recordings or source,
+        "match": origin.settings.get("match") or origin.pairs or None,
+        **more,
+    }
+    others |= more
     options = ScoreOptions.stated_in(origin.settings, **others, **({"stimuli": how.stimuli} if how.stimuli else {}))
     return score_record(model, options)
+
+
+def _additions(statistics: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options by which statistics came into a record beside those of every score."""
+    board = statistics.get("groups")
+    more: dict[str, Any] = {"explain": "estimator_walk" in statistics}
+    if isinstance(board, Mapping) and isinstance(board.get("groups"), list):
+        names = [str(group.get("group")) for group in board["groups"] if isinstance(group, Mapping)]
+        more["by"] = f"{board.get('by')}={'|'.join(names)}"
+    return more
 
 
 def _check_kinds(record: ResultRecord, model: Any, source: Any) -> None:
