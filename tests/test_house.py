@@ -30,7 +30,8 @@ BUDGETS = {
     # probes that list other trials
     "brainbench/metrics": 5_860,  # the unique part, drift over time, matching of units, ridge that chooses anew, noise
     # that neighbouring trials share
-    "brainbench/cli": 4_850,  # check-submission, options of benchmarks, names of the registry, RDMs of others compared
+    "brainbench/cli": 4_855,  # check-submission, options of benchmarks, names of the registry, RDMs of others compared,
+    # groups that a record states and that are scored again
     "brainbench/core": 5_705,  # times and areas of trials, the sealed door, seals of the cache, sealed plans, files of
     # users that are read as they stand, files that end on a full disk
     "leaderboards": 3_910,  # boards of 10,000 records, benchmarks and citations, means over benchmarks,
@@ -44,7 +45,7 @@ BUDGETS = {
 }
 """Folder → lines of Python that it may have: as the rooms stand, with two per cent to move in. Who adds a capability
 pays in the same folder, or raises the number in the commit that needs it, with the reason."""
-MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 97_950, 394
+MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 97_960, 394
 """Lines grew last by responses of any kind, errors of sweeps, boards of 10,000 records, ONNX files tried apart, drift
 over time, files of torch_brain and rsatoolbox both ways, real tactile devices fitted jointly to presses, air flow,
 rest shapes in space, species files, stimuli of single trials, contacts on the bent rod, claims scored again."""

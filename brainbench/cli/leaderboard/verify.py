@@ -236,24 +236,18 @@ def score_again(record: ResultRecord, how: Repetition) -> ResultRecord:
         raise UsageError(f"The record was made on the benchmark {brief(name)}; give it with --benchmark FILE.")
     if how.recordings is None and (not isinstance(source, str) or source not in DEMOS):
         raise UsageError(f"The record was made with recordings {str(source)[:80]!r}; give them with --recordings PATH.")
-    others = {
-        "recordings": how.recordings or source,
-        "match": origin.settings.get("match") or origin.pairs or None,
-        **more,
-    }
-    others |= more
-    options = ScoreOptions.stated_in(origin.settings, **others, **({"stimuli": how.stimuli} if how.stimuli else {}))
-    return score_record(model, options)
+    others = {"recordings": how.recordings or source, "match": origin.settings.get("match") or origin.pairs or None}
+    others |= more | ({"stimuli": how.stimuli} if how.stimuli else {})
+    return score_record(model, ScoreOptions.stated_in(origin.settings, **others))
 
 
 def _additions(statistics: Mapping[str, Any]) -> dict[str, Any]:
     """Return the options by which statistics came into a record beside those of every score."""
-    board = statistics.get("groups")
-    more: dict[str, Any] = {"explain": "estimator_walk" in statistics}
-    if isinstance(board, Mapping) and isinstance(board.get("groups"), list):
-        names = [str(group.get("group")) for group in board["groups"] if isinstance(group, Mapping)]
-        more["by"] = f"{board.get('by')}={'|'.join(names)}"
-    return more
+    board: Any = statistics.get("groups")
+    groups = board.get("groups") if isinstance(board, Mapping) else ()
+    groups = groups if isinstance(groups, list | tuple) else ()
+    names = "|".join(str(group.get("group")) for group in groups if isinstance(group, Mapping))
+    return {"explain": "estimator_walk" in statistics, "by": f"{board.get('by')}={names}" if names else None}
 
 
 def _check_kinds(record: ResultRecord, model: Any, source: Any) -> None:
