@@ -218,10 +218,10 @@ def dimensions(run: Run) -> Result:
         for true in (2, 5, 10):
             study = partial(_power_study, stimuli=stimuli, dimensions=true)
             found = np.array(run.each(study, list(run.seeds())))
-            effect, consistency, half = np.mean(found[:, 1:4], axis=0).tolist()
+            effect, consistency, reliability = np.mean(found[:, 1:4], axis=0).tolist()
             estimate = float(np.median(found[:, 4]))
             design = ExperimentDesign(
-                stimuli=stimuli, animals=8, effect=effect, consistency=consistency, reliability=2 * half / (1 + half)
+                stimuli=stimuli, animals=8, effect=effect, consistency=consistency, reliability=reliability
             )
             predicted = [
                 power(replace(design, dimensions=number), simulations=2000, seed=run.seed).power
@@ -235,7 +235,7 @@ def dimensions(run: Run) -> Result:
 
 
 def _power_study(seed: int, *, stimuli: int, dimensions: int) -> tuple[float, float, float, float, float]:
-    """Return p ≤ .05, and the effect, consistency, half reliability and dimensions of one experiment."""
+    """Return p ≤ .05, and the effect, consistency, reliability and dimensions of one experiment."""
     rng = np.random.default_rng([13, seed, stimuli, dimensions])
     animals, units, trials = 8, 60, 8
     shared = rng.normal(size=(stimuli, dimensions))
@@ -245,11 +245,9 @@ def _power_study(seed: int, *, stimuli: int, dimensions: int) -> tuple[float, fl
     model = rdm(simulated_boards.mixed(shared, 0.5, rng), method="sqeuclidean")
     labels = np.repeat(np.arange(stimuli), trials)
     responses = means[:, labels] + 2 * math.sqrt(dimensions) * rng.normal(size=(animals, len(labels), units))
-    halves = [responses.reshape(animals, stimuli, trials, units)[:, :, start::2].mean(axis=2) for start in (0, 1)]
-    first, second, brain, true = (
-        np.stack([rdm(one, method="sqeuclidean") for one in several])
-        for several in (*halves, (halves[0] + halves[1]) / 2, means)
-    )
+    measured = responses.reshape(animals, stimuli, trials, units).mean(axis=2)
+    brain, true = (np.stack([rdm(one, method="sqeuclidean") for one in several]) for several in (measured, means))
+    sessions = [[Trials(one, labels)] for one in responses]
     orders = np.concatenate(list(label_orders(stimuli, seed, exact=6, draws=999)))
     null = compare(model[permuted_pairs(orders)][:, None], brain, method="whitened-cosine").mean(axis=1)
 
@@ -260,8 +258,8 @@ def _power_study(seed: int, *, stimuli: int, dimensions: int) -> tuple[float, fl
         float((null >= null[0] - 1e-12).mean() <= 0.05),
         float(alike(model, true).mean()),
         float(alike(true[:, None], true)[np.triu_indices(animals, 1)].mean()),
-        float(alike(first, second).mean()),
-        signal_dimensions([[Trials(one, labels)] for one in responses], stimuli),
+        get_metric("rsa").animal("", sessions[0], stimuli, splits=10).reliability,
+        signal_dimensions(sessions, stimuli),
     )
 
 

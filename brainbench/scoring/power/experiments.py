@@ -6,8 +6,12 @@ they are in data: the fewer dimensions, the more of them depend on a few directi
 models agree by luck. With s shared by all animals and the other terms drawn anew for each:
 
     animal      t = √c · s + √(1 − c) · own        c: consistency between animals' noiseless RDMs
-    measured    √q · t + √(1 − q) · noise          q: reliability of an animal's RDM
+    measured    √q · t + √(1 − q) · noise          q: reliability of what differs between its distances
     model       (e/√c) · s + √(1 − e²/c) · other   e: the effect, the score that is true, between chance and 1
+
+A score states the reliability r of whole RDMs. Their mean distance is reliable and says nothing of a model: over n =
+K − 1 contrasts of Gaussian patterns it has h = (nD + 2)/((n − 1)(n + 2)) times the whitened square of the differences,
+from the same moments as the dimensions below, so q = r/(r + (1 + h)(1 − r)).
 
 Each experiment goes through the permutation test of a score, with the
 choice among ``layers`` of which one has the effect and the others know nothing. The comparison is the whitened one
@@ -160,7 +164,7 @@ class ExperimentDesign:
     consistency: Share = 0.8
     """Correlation of two animals' noiseless RDMs."""
     reliability: Share = 0.8
-    """Reliability of one animal's RDM."""
+    """Reliability of one animal's RDM, as a score and 'recordings rdm --metric rsa' state it."""
     layers: Count = 1
     """Layers among which one is chosen; one of them has the effect."""
     alpha: Annotated[float, Limit(above=0, below=1)] = 0.05
@@ -175,6 +179,13 @@ class ExperimentDesign:
                 f"No model can score {self.effect:g} on animals whose consistency is {self.consistency:g}: "
                 f"what they share bounds it by √consistency = {math.sqrt(self.consistency):.3g}; lower the effect."
             )
+
+    @property
+    def reliability_of_differences(self) -> float:
+        """Reliability of an animal's RDM without its mean distance, on which a comparison with a chance of 0 rests."""
+        contrasts = self.stimuli - 1
+        mean = (contrasts * self.dimensions + 2) / ((contrasts - 1) * (contrasts + 2))
+        return self.reliability / (self.reliability + (1 + mean) * (1 - self.reliability))
 
 
 @dataclass(frozen=True)
@@ -247,7 +258,7 @@ def simulate_experiments(generator: np.random.Generator, design: ExperimentDesig
         # Squared distances of Gaussian patterns have mean 2D and variance 8D.
         return (distances - 2 * design.dimensions) / math.sqrt(8 * design.dimensions)
 
-    c, q = design.consistency, design.reliability
+    c, q = design.consistency, design.reliability_of_differences
     # The three equations of the module's text; weights x and √(1 − x²) keep every RDM at unit variance.
     weight = design.effect / math.sqrt(c) if c else 0.0
     shared = rdms(size, 1)

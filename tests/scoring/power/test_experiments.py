@@ -9,10 +9,10 @@ import pytest
 
 from brainbench.core.contracts import Trials
 from brainbench.core.errors import DataError, UsageError
-from brainbench.metrics import compare
+from brainbench.metrics import compare, get_metric
 from brainbench.metrics.inference.permutation import label_orders, tail_p
 from brainbench.metrics.measures.rsa import score_rdms
-from brainbench.metrics.rdms.comparison import compare_all, permuted_comparisons
+from brainbench.metrics.rdms.comparison import compare_all, permuted_comparisons, products
 from brainbench.metrics.rdms.dissimilarity import rdm
 from brainbench.scoring.power.experiments import (
     MOST,
@@ -33,10 +33,31 @@ def test_the_simulated_rdms_have_the_stated_correlations():
     def r(a, b):
         return compare(a, b, method="whitened-pearson").mean()
 
-    assert r(model[:, 0], brain[:, 0]) == pytest.approx(0.5 * np.sqrt(0.6), abs=0.02)
-    assert r(brain[:, 0], brain[:, 1]) == pytest.approx(0.7 * 0.6, abs=0.02)
+    q = design.reliability_of_differences
+    assert r(model[:, 0], brain[:, 0]) == pytest.approx(0.5 * np.sqrt(q), abs=0.02)
+    assert r(brain[:, 0], brain[:, 1]) == pytest.approx(0.7 * q, abs=0.02)
     assert r(model[:, 1], brain[:, 0]) == pytest.approx(0, abs=0.02)
     assert brain.std() == pytest.approx(1, abs=0.02)
+
+
+@pytest.mark.parametrize(("stimuli", "dimensions", "noise"), [(6, 4, 7.0), (12, 2, 8.0), (16, 10, 14.0)])
+def test_reliability_is_that_of_whole_rdms_as_a_score_states_it(stimuli, dimensions, noise):
+    # The mean distance makes the RDMs of few stimuli look reliable, and tells no model from another.
+    rng, metric = np.random.default_rng(stimuli), get_metric("rsa")
+    labels, methods = np.repeat(np.arange(stimuli), 6), ("whitened-cosine", "whitened-pearson")
+    sizes = np.zeros((2, 2))
+    for _ in range(200):
+        patterns = rng.normal(size=(stimuli, dimensions)) @ rng.normal(size=(dimensions, 60))
+        trials = patterns[labels] + noise * rng.normal(size=(len(labels), 60))
+        measured = metric.animal("m", [Trials(trials, labels)], stimuli, splits=1).rdm
+        for side, values in enumerate((rdm(patterns, method="sqeuclidean"), measured)):
+            sizes[side] += [float(products(values, values, method)) for method in methods]
+    whole, differences = sizes[0] / sizes[1]
+    assert differences < whole - 0.02
+    design = ExperimentDesign(stimuli=stimuli, dimensions=dimensions, reliability=whole)
+    assert design.reliability_of_differences == pytest.approx(differences, abs=0.04)
+    for extreme in (0.0, 1.0):
+        assert dataclasses.replace(design, reliability=extreme).reliability_of_differences == extreme
 
 
 @pytest.mark.parametrize("layers", [1, 8])
@@ -102,7 +123,7 @@ def test_the_power_predicted_from_a_pilot_is_that_of_new_experiments(dimensions)
     """Trials of 60 neurons and whole experiments on them; everything that the prediction takes is measured on them."""
     stimuli, animals, units, studies = 10, 8, 60, 150
     rng = np.random.default_rng(dimensions)
-    found, effects, consistencies, halves, pilots = 0, [], [], [], []
+    found, effects, consistencies, reliabilities, pilots = 0, [], [], [], []
     for _ in range(studies):
         shared, other = rng.normal(size=(2, stimuli, dimensions))
         own = rng.normal(size=(animals, stimuli, dimensions))
@@ -118,19 +139,19 @@ def test_the_power_predicted_from_a_pilot_is_that_of_new_experiments(dimensions)
         true = np.stack([rdm(mean, method="sqeuclidean") for mean in means])
         effects.append(compare(model, true, method="whitened-pearson").mean())
         consistencies.append(compare_all(true, true, method="whitened-pearson")[np.triu_indices(animals, 1)].mean())
-        first, second = (np.stack([rdm(mean, method="sqeuclidean") for mean in half]) for half in noisy)
-        halves.append(compare(first, second, method="whitened-pearson").mean())
         if len(pilots) < 20:
             labels = np.repeat(np.arange(stimuli), 8)
-            sessions = [[Trials(mean[labels] + rng.normal(size=(len(labels), units)), labels)] for mean in means]
+            # The noise of their mean is that of the two halves above.
+            spread = 1.4 * np.sqrt(dimensions)
+            sessions = [[Trials(m[labels] + spread * rng.normal(size=(len(labels), units)), labels)] for m in means]
             pilots.append(signal_dimensions(sessions, stimuli))
-    half = np.mean(halves)
+            reliabilities += [get_metric("rsa").animal("m", one, stimuli, splits=20).reliability for one in sessions]
     design = ExperimentDesign(
         stimuli=stimuli,
         animals=animals,
         effect=float(np.mean(effects)),
         consistency=float(np.mean(consistencies)),
-        reliability=float(2 * half / (1 + half)),
+        reliability=float(np.mean(reliabilities)),
         dimensions=round(float(np.median(pilots))),
     )
     assert design.dimensions == pytest.approx(dimensions, rel=0.25)
