@@ -22,7 +22,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import UsageError, brief, check_number, repeats, unknown_name
+from brainbench.core.errors import UsageError, brief, check_number, listing, repeats, unknown_name
 from brainbench.core.figures import INK, PALE, check_format, new_figure, save_figure
 from brainbench.core.files import content_hash, read_json, to_plain, write_json
 from brainbench.core.limits import Count, Limit, Seed, limited
@@ -40,6 +40,7 @@ from brainbench.metrics.score import score_layers
 from brainbench.scoring.options import ScoreOptions
 
 WANTED = 0.8  # share of boards that the true candidate is to win
+_ROUNDING = 1e-9  # difference of scaled scores that is none
 
 
 @dataclass(frozen=True)
@@ -113,7 +114,11 @@ class Recovery:
 
         Yes or no where the interval of the win rate lies above or below ``wanted``. Yes also needs that as many
         of the pairs with the true network are told apart: a tied pair may stand in another order for other stimuli.
+        Where two candidates have equal scores on every board no design tells them apart.
         """
+        if self.alike:
+            pairs = listing((f"{left!r} from {right!r}" for left, right in self.alike), quoted=False)
+            return f"No design tells {pairs} by this metric: their scores are equal on every board; leave out the copy."
         interval = self.wins()
         said = f"the true network comes first in {self.win_rate:.0%} of {len(self.boards)} boards"
         said += f" [{interval.low:.0%}, {interval.high:.0%}]; by chance it would in {1 / len(self.names):.0%}"
@@ -125,6 +130,15 @@ class Recovery:
         if interval.high < wanted:
             return f"No, not in the {wanted:.0%} of boards that are wanted: {said}."
         return f"Undecided beside the {wanted:.0%} that are wanted, more boards would tell: {said}."
+
+    @property
+    def alike(self) -> list[tuple[str, str]]:
+        """Pairs of candidates whose scores are equal up to rounding on every board, such as a network and a copy."""
+        scaled = np.array([board.scaled for board in self.boards])
+        scaled = scaled[np.isfinite(scaled).all(axis=1)]
+        pairs = combinations(range(len(self.names)), 2)
+        equal = [pair for pair in pairs if len(scaled) and np.ptp(scaled[:, pair], axis=1).max() <= _ROUNDING]
+        return [(self.names[left], self.names[right]) for left, right in equal]
 
     def hardest(self, count: int = 3) -> list[tuple[str, str, float]]:
         """Return the pairs (true, mistaken for, share of the true one's boards) that are confused most often."""
@@ -140,9 +154,12 @@ class Recovery:
         notes = []
         if self.design.population.animals < FEWEST_ANIMALS or self.stimuli < FEWEST_STIMULI:
             notes.append(f"All pairs tie: tests need {FEWEST_ANIMALS} animals and {FEWEST_STIMULI} stimuli.")
-        undefined = sum(board.first is None for board in self.boards)
+        undefined = sum(not np.isfinite(board.scaled).any() for board in self.boards)
         if undefined:
             notes.append(f"{undefined} boards have no score: their animals cannot be compared.")
+        shared = sum(board.first is None for board in self.boards) - undefined
+        if shared:
+            notes.append(f"{shared} boards have no first: the highest score is shared.")
         return tuple(notes)
 
 
@@ -352,7 +369,8 @@ class RecoveryBoard(NullIsNaN):
         values = np.array(self.scaled)
         if not np.isfinite(values).any():
             return None
-        best = np.flatnonzero(values == np.nanmax(values))
+        # Networks with equal RDMs differ by rounding, which is no lead.
+        best = np.flatnonzero(values >= np.nanmax(values) - _ROUNDING)
         return int(best[0]) if len(best) == 1 else None
 
 

@@ -114,7 +114,7 @@ def recovery(
             design = replace(design, stimuli=None)
         folder = None if out is None else out / "boards"
         result = recover(candidates, design, boards=boards, folder=folder, **where, progress=progress)
-        if want is not None:
+        if want is not None and not result.alike:
             # About sixty boards of each design, however few the candidates.
             each = max(5, 60 // len(candidates))
             best, tried = find_cheapest(candidates, design, want, boards=each, **where, progress=progress)
@@ -191,7 +191,7 @@ def _pick(
 
 def _facts(recovery: Recovery, want: float | None) -> dict[str, Any]:
     """Return what --json and the file say of a recovery."""
-    names = ("win_rate", "outcomes", "reliability", "stimuli", "names", "firsts", "lost", "notes")
+    names = ("win_rate", "outcomes", "reliability", "stimuli", "names", "firsts", "lost", "alike", "notes")
     return {name: getattr(recovery, name) for name in names} | {
         "answer": recovery.answer(*([] if want is None else [want])),
         "interval": recovery.wins(),

@@ -275,7 +275,30 @@ def test_boards_without_a_score_or_with_equal_ones_have_no_winner():
     boards = (_board(0, 0, (math.nan, math.nan)), _board(1, 0, (0.5, 0.5)))
     found = Recovery(("a", "b"), DESIGN, 8, boards)
     assert not np.any(found.firsts)
-    assert len(found.notes) == 2
+    assert found.notes[-2:] == (
+        "1 boards have no score: their animals cannot be compared.",
+        "1 boards have no first: the highest score is shared.",
+    )
+
+
+def test_copies_of_a_network_are_named_and_never_ranked_by_rounding():
+    (network, rival) = make_candidates(10, names=("a", "c"))
+    random = np.random.default_rng(1)
+    turn = np.linalg.qr(random.standard_normal((6, 6)))[0]
+    copies = {
+        "same": lambda values: values,
+        "scaled": lambda values: 3.7 * values,
+        "shuffled": lambda values: values[:, random.permutation(6)],
+        "turned": lambda values: values @ turn + 5,
+    }
+    for name, change in copies.items():
+        layers = {layer: change(values) for layer, values in network.features.items()}
+        copy = Candidate.of(name, network.stimuli, layers)
+        result = recover((network, copy, rival), DESIGN, boards=2, workers=1)
+        assert result.alike == [("a", name)]
+        assert result.answer().startswith(f"No design tells 'a' from {name!r} by this metric")
+        assert not result.firsts[:2, :2].any()
+        assert result.notes == ("4 boards have no first: the highest score is shared.",)
 
 
 def test_equal_recoveries_have_equal_pictures(tmp_path):
