@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from brainbench.metrics import Metric
     from brainbench.scoring.options import ScoreOptions
 
+BY_CHANCE = 0.5  # share of the tuning by chance above which scores of chosen units err by more than some 10 %
 PUBLISHED_LAYOUT = "published-npz"  # layout of files of rates whose zeros the published estimators count
 
 
@@ -215,6 +216,21 @@ class NeuralResponses:
         # Without a gate no unit is judged.
         whole = given if averaged or options.units_reliability is None else self.trials(labels, averaged=True)
         return {name: reliable_units(own, len(labels), whole=whole[name], **how) for name, own in given.items()}
+
+    def chance_doubt(self, labels: tuple[str, ...], options: ScoreOptions) -> str:
+        """Return the doubt that reliable units are mostly those that pass the gate by chance; empty where they are not.
+
+        The gate takes units on the trials that are scored, which makes noise reliable.
+        """
+        from brainbench.metrics.reliability.halves import tuning_by_chance
+
+        if (least := options.units_reliability) is None:
+            return ""
+        blocks = [block for sessions in self.trials(labels, averaged=True).values() for block in sessions]
+        share = tuning_by_chance(blocks, len(labels), least=least, seed=options.seed)
+        if not share > BY_CHANCE:
+            return ""
+        return f"units of a reliability of {least:g}: those that shuffled labels leave have {share:.0%} of their tuning"
 
     def animals(
         self, labels: tuple[str, ...], metric: Metric, options: ScoreOptions, *, progress: Progress | None = None

@@ -262,6 +262,7 @@ def _compare(
     presentation = presentation_of(inputs.metric, inputs.animals, inputs.labels, control=baselines, seed=options.seed)
     spikes = "many trials share spikes with another one of their stimulus, which makes noise look reliable"
     recorded = brain.label_doubt, spikes if brain.dependent else "", of_no_neurons(inputs.metric, inputs.animals)
+    recorded = *recorded, brain.chance_doubt(inputs.labels, options)
     wrong = *presentation.doubts, *filter(None, recorded)
     scores = [doubted(score, *wrong) for score in scores]
     stated = scores[0].provenance

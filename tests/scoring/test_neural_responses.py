@@ -154,6 +154,18 @@ def test_recordings_without_labels_say_what_is_there(features, tmp_path):
         score(features(), recordings=_session(tmp_path, stimulus=np.array([""] * 60)), conditions="trials:stimulus")
 
 
+def test_units_that_were_chosen_by_chance_put_every_score_in_doubt(features):
+    silent, tuned = (make_recordings(6, animals=5, units=60, modulation=size) for size in (1e-6, 0.4))
+    doubt = "those that shuffled labels leave have"
+    record = score_record(features(6), recordings=silent, units_reliability=0.5)
+    for result in (record.score, record.animal_to_animal, *record.baselines.values()):
+        assert result.status == "unreliable"
+        assert doubt in " ".join(result.reasons)
+    sound = score(features(6), recordings=tuned, units_reliability=0.5)
+    assert sound.status == "ok"
+    assert doubt not in " ".join(sound.reasons)
+
+
 def test_bins_that_are_features_are_no_neurons():
     whole = open_neural_responses("demo-rodgers", progress=None, bin=0.2)
     for least in (None, 0.3):

@@ -11,6 +11,7 @@ to find, so report it with the score.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations, pairwise
@@ -24,7 +25,7 @@ from brainbench.metrics.rdms import dissimilarity
 from brainbench.metrics.rdms.comparison import features, upper
 from brainbench.metrics.reliability.noise_correction import spearman_brown
 from brainbench.metrics.reliability.sessions import Hashes, SortedTrials, draws, trial_hashes
-from brainbench.metrics.stimulus_labels import labelled_trials
+from brainbench.metrics.stimulus_labels import labelled_trials, stimulus_means
 
 _CHUNK_BYTES = 1 << 20  # sums of one chunk of splits stay in the processor's cache
 
@@ -321,6 +322,29 @@ def unit_reliability(blocks: Sequence[Trials], n_stimuli: int, *, seed: int = 0)
         mean = np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
         reliabilities.append(spearman_brown(mean))
     return tuple(reliabilities)
+
+
+def tuning_by_chance(blocks: Sequence[Trials], n_stimuli: int, *, least: float = UNIT_GATE, seed: int = 0) -> float:
+    """Return the tuning of the units that pass with random labels, as a share of that of those that pass; NaN for none.
+
+    Tuning is the variance of mean responses over stimuli, which squared distances sum up. Units are chosen on the
+    trials from which their reliability is taken afterwards, so what passes by chance looks reliable.
+    """
+    tuning = np.zeros(2)
+    for block in blocks:
+        values = np.asarray(block.responses, dtype=np.float64)
+        values = finite_mean(values, axis=1) if values.ndim == 3 else values
+        labels = np.asarray(block.labels)
+        # By hashes, so that the order in which trials came is irrelevant here too.
+        order = np.argsort(draws(trial_hashes(block, values, labels), np.zeros(1, dtype=np.int64), seed)[0])
+        random = np.empty_like(labels)
+        random[order] = np.sort(labels)
+        for side, codes in enumerate((labels, random)):
+            part = replace(block, responses=values, labels=codes)
+            passed = unit_reliability([part], n_stimuli, seed=seed)[0] >= least
+            means = stimulus_means(values[:, passed], codes, n_stimuli)
+            tuning[side] += float(np.nansum((means - finite_mean(means, axis=0)) ** 2))
+    return float(tuning[1] / tuning[0]) if tuning[0] > 0 else math.nan
 
 
 def reliable_units(

@@ -14,7 +14,14 @@ from brainbench.core.contracts import Trials
 from brainbench.core.errors import DataError, UsageError
 from brainbench.metrics import compare, rdm
 from brainbench.metrics.rdms.comparison import permuted_pairs
-from brainbench.metrics.reliability.halves import SplitRDMs, members, reliable_units, split_members, unit_reliability
+from brainbench.metrics.reliability.halves import (
+    SplitRDMs,
+    members,
+    reliable_units,
+    split_members,
+    tuning_by_chance,
+    unit_reliability,
+)
 from brainbench.metrics.reliability.noise_correction import spearman_brown
 from brainbench.metrics.reliability.sessions import SortedTrials, draws, grouped_sessions, key_hashes
 from brainbench.metrics.reliability.subject_rdm import drift_within, subject_rdm
@@ -217,12 +224,25 @@ def test_the_filter_is_per_unit():
     assert after.reliability > before.reliability
 
 
+def test_units_of_pure_noise_pass_the_filter_by_chance_alone():
+    labels, tuned = np.repeat(np.arange(6), 8), [_make_units(seed) for seed in range(6)]
+    noise = [Trials(np.random.default_rng([7, seed]).normal(size=(48, 100)), labels) for seed in range(6)]
+    # The filter makes noise reliable, which no reliability taken after it can show.
+    how = {"method": "crossnobis", "comparison": "whitened-cosine", "noise": "none", "splits": 50}
+    left = [subject_rdm("a", reliable_units([block], 6)[0], 6, **how).reliability for block in noise]
+    assert np.mean(left) > 0.5 > np.mean([subject_rdm("a", [block], 6, **how).reliability for block in noise])
+    assert tuning_by_chance(noise, 6) == pytest.approx(1, abs=0.35)
+    assert tuning_by_chance(tuned, 6) < 0.1
+    assert np.isnan(tuning_by_chance(noise, 6, least=1 - 1e-12))
+
+
 def test_the_order_of_trials_and_units_is_irrelevant():
     block = _make_units()
     rng = np.random.default_rng(1)
     rows, columns = rng.permutation(120), rng.permutation(21)
     moved = Trials(block.responses[np.ix_(rows, columns)], block.labels[rows], [block.keys[row] for row in rows])
     np.testing.assert_allclose(unit_reliability([moved], 6)[0], unit_reliability([block], 6)[0][columns], atol=1e-12)
+    assert tuning_by_chance([moved], 6) == pytest.approx(tuning_by_chance([block], 6))
 
 
 def test_misuse_of_units_is_told_in_a_sentence():
