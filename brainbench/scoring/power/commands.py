@@ -52,6 +52,7 @@ def power(
     Correlation, consistency and reliability of your own recordings: 'brainbench score' and
     'brainbench recordings rdm'.
     """
+    from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE
     from brainbench.scoring.power import experiments
 
     if layer is not None and (plan is None or options["layers"] != 1):
@@ -92,6 +93,8 @@ def power(
     }
     note = "True score 0 is the rate of false alarms. Animals needed are for the given stimuli, and the reverse."
     note += "" if pilot is None else " The pilot gives dimensions alone: state its own --reliability and --consistency."
+    if first.reliability < RELIABILITY_GATE:
+        note += f" Scores of animals of a reliability below {RELIABILITY_GATE:g} are unreliable, whatever their p."
     data = {
         "dimensions": {"number": number, "origin": origin},
         "note": note,

@@ -27,6 +27,12 @@ def test_an_impossible_design_is_refused(run):
     assert "--stimuli must be a whole number, at least 2; received 1." in few.err
 
 
+def test_a_design_whose_scores_could_not_be_ok_is_said_to_be_one(run):
+    for reliability, said in (("0.49", True), ("0.5", False)):
+        text = run("power", "--animals", "2", "--effect", "0.3", "--simulations", "1", "--reliability", reliability)
+        assert ("below 0.5 are unreliable, whatever their p" in text.out) is said
+
+
 def test_dimensions_are_estimated_given_or_assumed(run, tmp_path):
     from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry, write_files
 
