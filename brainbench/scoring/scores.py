@@ -262,7 +262,7 @@ def _compare(
     presentation = presentation_of(inputs.metric, inputs.animals, inputs.labels, control=baselines, seed=options.seed)
     spikes = "many trials share spikes with another one of their stimulus, which makes noise look reliable"
     recorded = brain.label_doubt, spikes if brain.dependent else "", of_no_neurons(inputs.metric, inputs.animals)
-    recorded = *recorded, brain.chance_doubt(inputs.labels, options)
+    recorded = *recorded, brain.chance_doubt(inputs.labels, options), same_stimuli(inputs)
     wrong = *presentation.doubts, *filter(None, recorded)
     scores = [doubted(score, *wrong) for score in scores]
     stated = scores[0].provenance
@@ -367,6 +367,20 @@ def of_no_neurons(metric: Any, animals: Sequence[Any]) -> str:
         return ""
     share = f"{EXACT:.0%} of the tuning in {len(marked)} of {len(animals)} animals ({marked[0]})"
     return f"units that never vary between trials, as neurons do, have more than {share}: leave them out"
+
+
+def same_stimuli(inputs: ScoreInputs) -> str:
+    """Return the doubt that labels name one stimulus, to which any network responds alike as animals do; or nothing."""
+    values, names = inputs.network.model_input, dict[bytes, list[str]]()
+    if values is None:
+        return ""
+    for label, row in zip(inputs.labels, inputs.rows, strict=True):
+        # Adding zero turns −0.0 into 0.0.
+        names.setdefault((values[row] + 0.0).tobytes(), []).append(label)
+    same = listing((" = ".join(labels) for labels in names.values() if len(labels) > 1), limit=3, quoted=False)
+    if same == "none":
+        return ""
+    return f"labels of one stimulus ({same}), which unrelated networks find alike too: join or drop them (--match)"
 
 
 def influence_of(score: Score, metric: Any, animals: Sequence[Any]) -> tuple[dict[str, Any], tuple[str, ...]]:

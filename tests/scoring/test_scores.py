@@ -264,6 +264,18 @@ def test_a_plain_module_is_scored_on_arrays_without_registration(recordings: xr.
     assert record.card.input == "as given"
 
 
+def test_one_stimulus_under_two_labels_puts_every_score_in_doubt(recordings: xr.Dataset, arrays: Path):
+    import h5py
+
+    # Animals and any network respond alike to it: of unrelated networks a third had p ≤ .05 with six stimuli.
+    with h5py.File(arrays, "r+") as file:
+        file["stimuli"][4] = file["stimuli"][1]
+    record = score_record(_Tiny(), recordings=recordings, stimuli=str(arrays))
+    for result in (record.score, record.animal_to_animal, *record.baselines.values()):
+        assert result.status == "unreliable"
+        assert "labels of one stimulus (b = e)" in " ".join(result.reasons)
+
+
 def test_units_can_be_chosen_for_plain_modules_alone(recordings: xr.Dataset, arrays: Path, truth: Path):
     given = {"recordings": recordings, "stimuli": str(arrays), "normalize": False}
     assert brainbench.score(_Tiny(), **given).status == "ok"
