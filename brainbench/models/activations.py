@@ -100,9 +100,10 @@ def extract(
     A model with ``layers`` and ``activations`` (all of ours) gives its named layers. Any other module is read by hooks
     at its parts that have no parts or have weights of their own, and at its output under the name ``output``. A tensor
     counts as a layer if its rows are proven to follow the stimuli, wherever they lie in it; its time axis is the one
-    that is proven to follow time, else T = 1. Calls of one module are ``name[0]``, ``name[1]``, …, or the time steps of
-    one layer if they are proven to be. Of a tuple or mapping the first tensor counts, of a list of one shape all. The
-    result's ``report`` names what was not read, and why.
+    that is proven to follow time, else T = 1. Layers of a model that is made of our parts alone are proven in our
+    tests. Calls of one module are ``name[0]``, ``name[1]``, …, or the time steps of one layer if they are proven to be.
+    Of a tuple or mapping the first tensor counts, of a list of one shape all. The result's ``report`` names what was
+    not read, and why.
 
     The model runs in evaluation mode without gradients on copies of the stimuli; modes are put back and no hook stays.
     The proof runs a copy of it on 8 probes and an eighth of the stimuli, and at the end itself on two of these again;
@@ -141,14 +142,11 @@ def extract(
     with _surroundings(model) as device, evaluating(model), torch.no_grad():
         run = _Run(model, values, device)
         if readout != "default":
-            reader = partial(find_readout(readout).activations, model, layers=layers)
+            _read_proven(run, partial(find_readout(readout).activations, model, layers=layers), rooms, chunk)
+        elif is_ours(model):
+            _read_proven(run, named_reader(model, layers), rooms, chunk)
         else:
-            reader = named_reader(model, layers)
-        if reader is not None:
-            ours = type(model).__module__.startswith("brainbench.")  # whose layers our tests prove
-            _read_named(run, reader, rooms, chunk, proven=ours or readout != "default")
-        else:
-            _HookedReader(run, layers, rooms).read(chunk)
+            _ForeignReader(run, layers, rooms).read(chunk)
     result = rooms.close(run.notes)
     if not result:
         raise UsageError(
@@ -167,14 +165,30 @@ def find_readout(name: str) -> Any:
     return readout
 
 
-def named_reader(model: nn.Module, layers: Collection[str] | None) -> Any:
+def named_layers(model: nn.Module) -> tuple[str, ...] | None:
+    """Return the layers that a model names, which its method ``activations`` gives; None for any other module.
+
+    An attribute ``layers`` alone, such as a list of modules, names none.
+    """
+    names = getattr(model, "layers", None)
+    if not isinstance(names, tuple) or not all(isinstance(name, str) for name in names):
+        return None
+    return names if callable(getattr(model, "activations", None)) else None
+
+
+def named_reader(model: Any, layers: Collection[str] | None) -> Any:
     """Return a function from stimuli to activations if the model names its layers itself."""
-    names, read = getattr(model, "layers", None), getattr(model, "activations", None)
-    if not isinstance(names, tuple) or not all(isinstance(name, str) for name in names) or not callable(read):
+    if (names := named_layers(model)) is None:
         return None
     check_each("layer", layers or (), names)
     wanted = names if layers is None else tuple(name for name in names if name in layers)
-    return lambda part: read(part, wanted)
+    return lambda part: model.activations(part, wanted)
+
+
+def is_ours(model: nn.Module) -> bool:
+    """Return whether a model names its layers and is made of our parts alone, whose layers our tests prove."""
+    packages = {type(part).__module__.partition(".")[0] for part in model.modules()}
+    return named_layers(model) is not None and packages <= {"brainbench", "torch"}
 
 
 @contextmanager
@@ -395,38 +409,16 @@ def _plain(rows: torch.Tensor) -> np.ndarray:
     return rows.detach().to("cpu", dtype=torch.float32).numpy()
 
 
-def _read_named(run: _Run, read: Any, rooms: _Rooms, chunk: int, *, proven: bool) -> None:
-    """Read a model that names its layers [B, T, …]; one that is not ours has to give the same rows in other batches."""
+def _read_proven(run: _Run, read: Any, rooms: _Rooms, chunk: int) -> None:
+    """Read layers [B, T, …] that need no proof."""
     import torch
 
-    from brainbench.models import proof
-
-    def layers(part: torch.Tensor, reader: Any) -> Iterator[tuple[str, torch.Tensor]]:
-        for name, activity in run(reader, part).items():
-            rooms.order.setdefault(name, len(rooms.order))
-            values = torch.view_as_real(activity.resolve_conj()) if activity.is_complex() else activity
-            yield name, values.reshape(*values.shape[:2], -1)
-
-    sketches = None if proven else _Sketches(run.sample)
-    fresh = None if proven else proof.fresh_copy(run.model)
     for place in run.chunks(chunk):
-        for name, rows in layers(run.stimuli(place), read):
+        for name, activity in run(read, run.stimuli(place)).items():
+            rooms.order.setdefault(name, len(rooms.order))
             rooms.called.add(name)
-            rooms.write(name, _plain(rows), place)
-            if sketches is not None:
-                sketches.add(0, (name, None), rows, range(place.start, place.stop))
-    if sketches is None:
-        return
-
-    def compare(reader: Any, stimuli: np.ndarray) -> None:
-        for picks in np.split(stimuli, range(_SAMPLED, len(stimuli), _SAMPLED)):
-            for name, rows in layers(run.stimuli(picks), reader):
-                sketches.add(1, (name, None), rows, picks)
-        for name in sketches.unequal():
-            raise run.refusal(name)
-
-    compare(read if fresh is None else named_reader(fresh, tuple(rooms.order)), run.sample)
-    compare(read, run.first)
+            values = torch.view_as_real(activity.resolve_conj()) if activity.is_complex() else activity
+            rooms.write(name, _plain(values.reshape(*values.shape[:2], -1)), place)
 
 
 @dataclass(frozen=True)
@@ -439,8 +431,8 @@ class _Place:
     moved: bool = True  # whether rows of unequal probes differed; if not, those of the stimuli have to
 
 
-class _HookedReader:
-    """Reads a network of others: proves what its parts return on a copy of it, then runs it once."""
+class _ForeignReader:
+    """Reads a network of others: proves what its parts return, or what it names, on a copy of it, then runs it once."""
 
     def __init__(self, run: _Run, layers: Collection[str] | None, rooms: _Rooms) -> None:
         import torch
@@ -448,12 +440,13 @@ class _HookedReader:
         from brainbench.models import proof
 
         self.run, self.rooms, self.layers = run, rooms, layers
+        self.named = named_reader(run.model, layers) is not None
         self.modules = self._modules(run.model)
         rooms.order = {name: place for place, name in enumerate(self.modules)}
         self.fresh = proof.fresh_copy(run.model)
         if self.fresh is None:
             run.notes.append("the model cannot be copied, so a state that its first batch leaves is not noticed")
-        if any(isinstance(part, torch.jit.ScriptModule) for part in run.model.modules()):
+        if not self.named and any(isinstance(part, torch.jit.ScriptModule) for part in run.model.modules()):
             run.notes.append("parts that run in TorchScript cannot be read: give the module that was scripted")
         self.places: dict[tuple[str, int], _Place] = {}
         self.calls: dict[str, int] = {}
@@ -464,6 +457,8 @@ class _HookedReader:
     def _modules(self, model: nn.Module) -> dict[str, nn.Module]:
         from brainbench.models import proof
 
+        if (names := named_layers(model)) is not None:
+            return {name: model for name in names if self.layers is None or name in self.layers}
         if self.layers is None:
             return {**proof.layer_modules(model), OUTPUT: model}
         every = {name.replace("_orig_mod.", ""): module for name, module in model.named_modules() if name}
@@ -489,11 +484,12 @@ class _HookedReader:
         self._check(rooms.not_read)
 
     def _check(self, not_read: Mapping[str, str]) -> None:
-        """Refuse a model whose output is no answer to a stimulus, and layers asked for that are none."""
+        """Refuse a model whose output, or a layer that it names, is no answer to a stimulus, and layers asked for."""
         from brainbench.models.proof import DEPENDENT
 
-        if not_read.get(OUTPUT) == DEPENDENT and self.modules.get(OUTPUT) is self.run.model:
-            raise self.run.refusal(OUTPUT)
+        for name, reason in not_read.items():
+            if reason == DEPENDENT and self.modules.get(name) is self.run.model:
+                raise self.run.refusal(name)
         for name in self.layers or ():
             base, run = name.partition("[")[0], {layer.partition("[")[0] for layer in self.rooms.written}
             if base not in self.rooms.called:
@@ -515,6 +511,16 @@ class _HookedReader:
             take(name, index, proof.first_tensor(output))
 
         modules = self._modules(model)
+        if self.named:
+            answers = self.run(named_reader(model, self.layers), part)
+            if not isinstance(answers, Mapping):
+                raise UsageError(
+                    f"{type(model).__name__}.activations(x, layers) gives a mapping from layers to tensors; it gave a "
+                    f"{type(answers).__name__}."
+                )
+            for name in modules:
+                count(name, answers.get(name))
+            return dict.fromkeys(modules, 1)
         # A root's hook does not run for every kind of module, its result is here anyway.
         with proof.hooks({name: module for name, module in modules.items() if module is not model}, count):
             output = self.run(model, part)

@@ -376,10 +376,12 @@ class ModelSize:
 
 def measure(located: LocatedModel) -> ModelSize:
     """Count a network's parameters and multiply-adds."""
+    from brainbench.models.activations import named_layers
+
     model = located.outline()
     count: Callable[[], int] | None = getattr(model, "multiply_adds", None)
     parameters = sum(parameter.numel() for parameter in model.parameters())
-    return ModelSize(parameters, count() if count is not None else None, tuple(getattr(model, "layers", ())))
+    return ModelSize(parameters, count() if count is not None else None, named_layers(model) or ())
 
 
 @functools.cache

@@ -115,15 +115,15 @@ class ResolvedModel:
 
     def respond(self, options: ScoreOptions, *, progress: Progress | None = None) -> ModelResponses:
         """Run the model on the stimuli, or take the features that were computed elsewhere."""
+        from brainbench.models.activations import extract, find_readout, is_ours, named_layers
+
         card, labels, origin, model_input = self.card, self.labels, self.origin, None
         if not options.normalize and (self.module is None or _has_contract(self.module)):
             reads = "was computed elsewhere" if self.module is None else "normalises SI values by itself"
             raise UsageError(f"normalize=False gives SI values to plain modules; {card.name!r} {reads}: leave it out.")
         card, simulated = replace(card, layer=options.layer or card.layer), None
-        names = getattr(self.module, "layers", None) if self.module is not None else self.activations
+        names = named_layers(self.module) if self.module is not None else self.activations
         if options.readout == "published":
-            from brainbench.models.activations import find_readout
-
             if self.module is None:
                 raise UsageError("The published readout needs a network; these are features computed elsewhere.")
             # A committed layer goes by our names; theirs are other arrays, so only the caller can commit to one.
@@ -145,8 +145,6 @@ class ResolvedModel:
             wanted = options.layers or computed
             activations = {layer: _as_steps(layer, computed[layer], len(labels)) for layer in wanted}
         else:
-            from brainbench.models.activations import extract, named_reader
-
             values, comparable, note = _network_input(self.module, simulated, options.normalize)
             if card.objective not in (None, "untrained") and (difference := _unlike_training(self.module, simulated)):
                 _LOG.warning("%s was trained on other stimuli: here %s.", card.name, difference)
@@ -159,7 +157,7 @@ class ResolvedModel:
                 reduce=mean_over_time if options.time == "mean" and not options.over_time else None,
                 memory=options.memory,
             )
-            if options.readout == "default" and named_reader(self.module, None) is None:
+            if options.readout == "default" and not is_ours(self.module):
                 origin = {**origin, "reading": activations.report.stated}
             card = replace(card, input=note)
             steps = comparable if comparable.ndim > 2 else comparable[:, None, :]

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from torch import nn
 from torch.nn import functional
 
 from brainbench.core.errors import UsageError
-from brainbench.models.activations import extract
+from brainbench.models.activations import extract, is_ours, named_layers
 from brainbench.models.registry import load_model
 
 K, T = 5, 4
@@ -651,22 +652,86 @@ def test_a_model_of_one_batch_size_is_read_in_it():
     np.testing.assert_allclose(extract(model, x, chunk=8)["read"], expected, atol=1e-5)
 
 
-def test_a_model_of_others_that_names_its_layers_is_proven_too():
-    class Named(nn.Module):
-        layers = ("mean",)
+class _Named(nn.Module):
+    layers: Any = ("first", "second")
 
-        def __init__(self, mixes):
+    def __init__(self, answer):
+        super().__init__()
+        self.answer, self.read = answer, nn.Linear(210, 9)
+
+    def forward(self, x):
+        return self.read(x.flatten(2))
+
+    def activations(self, x, layers):
+        return self.answer(self(x))
+
+
+def test_layers_that_a_model_of_others_names_are_proven_too():
+    x = torch.randn(12, 4, 6, 5, 7)
+    model = _Named(lambda y: {"first": y, "second": y.transpose(1, 2)})
+    with torch.no_grad():
+        expected = model(x).numpy()
+    layers = extract(model, x)  # time is where it moves, not where it is said to be
+    np.testing.assert_array_equal(layers["first"], expected)
+    np.testing.assert_array_equal(layers["second"], expected)
+    assert list(extract(model, x, layers=["second"])) == ["second"]
+    mixes = _Named(lambda y: {"first": y, "second": y - y.mean(0)})
+    with pytest.raises(UsageError, match=r"_Named answers the same stimuli otherwise .* \(layer 'second'\)"):
+        extract(mixes, x)
+
+
+@pytest.mark.parametrize(
+    ("answer", "reason"),
+    [
+        (lambda y: {"first": y, "second": y.new_ones(len(y), 4, 9)}, "does not move with the stimuli"),
+        (lambda y: {"first": y, "second": None}, "gives no tensor of numbers"),
+        (lambda y: {"first": y}, "gives no tensor of numbers"),
+    ],
+)
+def test_a_layer_that_a_model_of_others_names_and_that_is_none_is_left_out_with_its_reason(answer, reason):
+    x = torch.randn(12, 4, 6, 5, 7)
+    layers = extract(_Named(answer), x)
+    assert list(layers) == ["first"]
+    assert layers.report.not_read == {"second": reason}
+    with pytest.raises(UsageError, match=f"Layer 'second' of _Named cannot be read: {reason}"):
+        extract(_Named(answer), x, layers=["second"])
+
+
+def test_a_model_of_others_that_names_layers_returns_a_mapping():
+    with pytest.raises(UsageError, match="gives a mapping from layers to tensors; it gave a list"):
+        extract(_Named(lambda y: [y, y]), torch.randn(12, 4, 6, 5, 7))
+
+
+def test_a_list_of_modules_that_is_called_layers_names_none():
+    class Stack(nn.Module):
+        def __init__(self):
             super().__init__()
-            self.mixes = mixes
+            self.layers, self.activations = nn.ModuleList([nn.Linear(210, 9)]), nn.ReLU()
 
-        def activations(self, x, layers):
-            y = x.flatten(2)
-            return {"mean": y - y.mean(0) if self.mixes else y}
+        def forward(self, x):
+            return self.activations(self.layers[0](x.flatten(2)))
 
-    x = torch.randn(9, 4, 6, 5, 7)
-    np.testing.assert_array_equal(extract(Named(False), x)["mean"], x.flatten(2))
-    with pytest.raises(UsageError, match="Named answers the same stimuli otherwise"):
-        extract(Named(True), x)
+    assert named_layers(Stack()) is None
+    assert list(extract(Stack(), torch.randn(12, 4, 6, 5, 7))) == ["layers.0", "activations", "output"]
+
+
+def test_a_network_of_ours_with_a_part_of_others_is_proven():
+    class Counter(nn.Module):
+        calls = 0
+
+        def forward(self, x):
+            self.calls += 1
+            return x + self.calls
+
+    model = load_model("zhuang-feedforward-small", classes=5)
+    x = torch.randn(12, 6, 30, 5, 7) * 1e-4
+    assert is_ours(model)
+    before = extract(model, x)["decoder"]
+    model.decoder = nn.Sequential(model.decoder, nn.Identity())
+    np.testing.assert_array_equal(extract(model, x)["decoder"], before)
+    model.decoder[1] = Counter()
+    with pytest.raises(UsageError, match="EncoderAttenderDecoder answers the same stimuli otherwise"):
+        extract(model, x)
 
 
 def test_decisions_and_counts_are_numbers_too(stimuli):

@@ -276,6 +276,18 @@ def test_one_stimulus_under_two_labels_puts_every_score_in_doubt(recordings: xr.
         assert "labels of one stimulus (b = e)" in " ".join(result.reasons)
 
 
+def test_a_layer_within_a_list_of_modules_that_is_called_layers_can_be_committed_to(
+    recordings: xr.Dataset, arrays: Path
+):
+    class Stack(_Tiny):
+        def __init__(self) -> None:
+            super().__init__()
+            self.layers = nn.ModuleList([self.fc])
+
+    score = brainbench.score(Stack(), recordings=recordings, stimuli=str(arrays), layer="fc")
+    assert (score.layer, score.layer_rule) == ("fc", "committed to beforehand")
+
+
 def test_units_can_be_chosen_for_plain_modules_alone(recordings: xr.Dataset, arrays: Path, truth: Path):
     given = {"recordings": recordings, "stimuli": str(arrays), "normalize": False}
     assert brainbench.score(_Tiny(), **given).status == "ok"

@@ -163,14 +163,14 @@ class _Network:
     @classmethod
     def of(cls, model: Any, layer: str) -> _Network:
         """Find a network; the layer is the one it commits to, or else the one asked for."""
-        from brainbench.models.activations import named_reader
+        from brainbench.models.activations import named_layers, named_reader
 
         resolved = resolve_model(model)
         if resolved.module is None:
             raise UsageError(
                 f"{resolved.card.name} is a file of activations and cannot be run on other motions; give the network."
             )
-        layers = getattr(resolved.module, "layers", None)
+        layers = named_layers(resolved.module)
         chosen = resolved.card.layer if layer in ("any", "last") else layer
         if chosen is None:
             if not layers:
