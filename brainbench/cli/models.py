@@ -204,14 +204,16 @@ def export(
     seed: SeedOption = 0,
 ) -> Output:
     """Export one step, obs and h_in to features and h_out, with its contract, and check the written file."""
-    from brainbench.models.export import SUFFIXES, export_model
-    from brainbench.models.registry import load_model
+    from brainbench.models.registry import locate_model
     from brainbench.models.training.checkpoints import PREFIXES, find_folder
+
+    located = locate_model(model)  # before PyTorch is imported
+    from brainbench.models.export import SUFFIXES, export_model
 
     name = find_folder(model).resolve().name if model.startswith(PREFIXES) else model
     target = out or Path(f"{name}{SUFFIXES.get(format, '')}")
     with progress_bar("exporting the network"):
-        exported = export_model(load_model(model, seed=seed), target, format=format, name=model)
+        exported = export_model(located.build(seed), target, format=format, name=model)
     text = (
         f"{model}: {exported.features} features, {exported.state_size:,} numbers of state; the file agrees with the "
         f"network to {exported.difference:.1e}\n\nfile      {exported.path}\ncontract  {exported.contract}"

@@ -52,9 +52,6 @@ def train(
     Several GPUs: torchrun --nproc-per-node N -m brainbench train …
     """
     from brainbench.models.training.config import TrainingConfig, best_run, sweep_runs
-    from brainbench.models.training.evaluation import RANDOM, RAW, TWIN
-    from brainbench.models.training.trainer import BEST
-    from brainbench.models.training.trainer import train as run
 
     options = (read_mapping(config) if config is not None else {}) | options
     if (stated := options.pop("model", model)) != model:
@@ -69,6 +66,11 @@ def train(
     results: dict[str, TrainingResult] = {}
     with progress_bar() as progress:
         source = SweepFolder(data, progress)
+        # What is wrong with options or data is told before PyTorch is imported.
+        from brainbench.models.training.evaluation import RANDOM, RAW, TWIN
+        from brainbench.models.training.trainer import BEST
+        from brainbench.models.training.trainer import train as run
+
         for training, folder in runs:
             report = _named(progress, folder.name) if sweep is not None else progress
             results[str(folder)] = run(

@@ -185,6 +185,24 @@ def named_reader(model: Any, layers: Collection[str] | None) -> Any:
     return lambda part: model.activations(part, wanted)
 
 
+def check_layers(model: nn.Module, layers: Iterable[str]) -> None:
+    """Raise UsageError unless a model has layers, or parts, of these names; calls of a part are ``part[0]``, …."""
+    choices = _choices(model)
+    check_each("layer", sorted({_part_name(layer, choices) for layer in layers}), choices)
+
+
+def _choices(model: nn.Module) -> dict[str, nn.Module]:
+    """Return what may be asked for of a model: the layers that it names, or else its parts and its output."""
+    if (names := named_layers(model)) is not None:
+        return dict.fromkeys(names, model)
+    parts = {name.replace("_orig_mod.", ""): part for name, part in model.named_modules() if name}
+    return {**parts, OUTPUT: parts.get(OUTPUT, model)}
+
+
+def _part_name(layer: str, choices: Collection[str]) -> str:
+    return layer if layer in choices else layer.partition("[")[0]
+
+
 def is_ours(model: nn.Module) -> bool:
     """Return whether a model names its layers and is made of our parts alone, whose layers our tests prove."""
     packages = {type(part).__module__.partition(".")[0] for part in model.modules()}
@@ -457,15 +475,12 @@ class _ForeignReader:
     def _modules(self, model: nn.Module) -> dict[str, nn.Module]:
         from brainbench.models import proof
 
-        if (names := named_layers(model)) is not None:
-            return {name: model for name in names if self.layers is None or name in self.layers}
+        choices = _choices(model)
         if self.layers is None:
-            return {**proof.layer_modules(model), OUTPUT: model}
-        every = {name.replace("_orig_mod.", ""): module for name, module in model.named_modules() if name}
-        choices = {OUTPUT: model} | every
-        wanted = {name.partition("[")[0] if name not in choices else name for name in self.layers}
-        check_each("layer", sorted(wanted), choices)
-        return {name: choices[name] for name in (*every, OUTPUT) if name in wanted}
+            return choices if self.named else {**proof.layer_modules(model), OUTPUT: model}
+        check_layers(model, self.layers)
+        wanted = {_part_name(layer, choices) for layer in self.layers}
+        return {name: part for name, part in choices.items() if name in wanted}
 
     def read(self, chunk: int) -> None:
         """Prove and read all layers."""

@@ -267,6 +267,9 @@ def export_model(model: nn.Module, path: str | Path, *, format: str = "onnx", na
     check_name("export format", format, SUFFIXES)
     target = Path(path)
     target = target if target.suffix else target.with_suffix(SUFFIXES[format])
+    for other_format, suffix in SUFFIXES.items():
+        if target.suffix == suffix and other_format != format:
+            raise UsageError(f"{brief(str(target))} is named as a file of the format {other_format!r}, not {format!r}.")
     step = StreamingStep(copy.deepcopy(model).cpu().float().eval()).eval()
     with atomic_path(target) as temporary:
         example = torch.zeros(2, *step.model.spec.input_shape), step.init_state(2)

@@ -113,23 +113,36 @@ class ResolvedModel:
     """Labels of the rows of ``activations``; None when they follow the stimuli."""
     origin: Mapping[str, Any] = field(default_factory=dict)
 
-    def respond(self, options: ScoreOptions, *, progress: Progress | None = None) -> ModelResponses:
-        """Run the model on the stimuli, or take the features that were computed elsewhere."""
-        from brainbench.models.activations import extract, find_readout, is_ours, named_layers
+    def committed(self, options: ScoreOptions) -> ModelCard:
+        """Return the card with the layer that is committed to; options that do not suit the model are refused."""
+        from brainbench.models.activations import check_layers, find_readout, named_layers
 
-        card, labels, origin, model_input = self.card, self.labels, self.origin, None
+        card, layers = self.card, options.layers or ()
         if not options.normalize and (self.module is None or _has_contract(self.module)):
             reads = "was computed elsewhere" if self.module is None else "normalises SI values by itself"
             raise UsageError(f"normalize=False gives SI values to plain modules; {card.name!r} {reads}: leave it out.")
-        card, simulated = replace(card, layer=options.layer or card.layer), None
-        names = named_layers(self.module) if self.module is not None else self.activations
         if options.readout == "published":
             if self.module is None:
                 raise UsageError("The published readout needs a network; these are features computed elsewhere.")
             # A committed layer goes by our names; theirs are other arrays, so only the caller can commit to one.
-            card, names = replace(card, layer=options.layer), find_readout(options.readout).layers(self.module)
-        if card.layer is not None and names is not None and card.layer not in (options.layers or names):
-            raise unknown_name("layer", card.layer, options.layers or names)
+            card, names = replace(card, layer=None), find_readout(options.readout).layers(self.module)
+        else:
+            names = self.activations if self.module is None else named_layers(self.module)
+        card = replace(card, layer=options.layer or card.layer)
+        if names is not None:
+            check_each("layer", layers, names)
+        elif self.module is not None:
+            check_layers(self.module, filter(None, (*layers, card.layer)))
+        if card.layer is not None and (choices := layers or names) and card.layer not in choices:
+            raise unknown_name("layer", card.layer, choices)
+        return card
+
+    def respond(self, options: ScoreOptions, *, progress: Progress | None = None) -> ModelResponses:
+        """Run the model on the stimuli, or take the features that were computed elsewhere."""
+        from brainbench.models.activations import extract, is_ours
+
+        card, simulated = self.committed(options), None
+        labels, origin, model_input = self.labels, self.origin, None
         if labels is None:
             from brainbench.stimuli import load_stimuli
 
@@ -141,7 +154,6 @@ class ResolvedModel:
             labels, origin = simulated.labels, {**origin, "stimuli": stated}
         if self.module is None or simulated is None:
             computed = self.activations or {}
-            check_each("layer", options.layers or (), computed)
             wanted = options.layers or computed
             activations = {layer: _as_steps(layer, computed[layer], len(labels)) for layer in wanted}
         else:
@@ -194,27 +206,30 @@ def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
         features = read_features(path)
         card = ModelCard(path.stem, family=_ELSEWHERE, weights=file_hash(path))
         return ResolvedModel(card, None, features.activations, features.labels, {"features": path.name})
+    from brainbench.models.registry import load_user_model, locate_model
+    from brainbench.models.training.checkpoints import CONFIG, PREFIXES
+
+    is_code = isinstance(model, str) and (model.endswith(".py") or (":" in model and not model.startswith(PREFIXES)))
+    # A name that stands for nothing is told before PyTorch is imported.
+    entry = locate_model(model) if isinstance(model, str) and not is_code else None
     import torch
 
     from brainbench.models.ops.layers import check_weights, weights_hash
     from brainbench.models.proof import unwrapped
-    from brainbench.models.registry import load_user_model, locate_model
-    from brainbench.models.training.checkpoints import CONFIG, PREFIXES
     from brainbench.models.zoo import graph_of
 
     model = unwrapped(model)
     if isinstance(model, torch.nn.Module):
         module, card = model, ModelCard(type(model).__name__, family="user module")
-    elif not isinstance(model, str):
+    elif is_code:
+        module = unwrapped(load_user_model(model, seed=seed))
+        card = ModelCard(model, family="user module", seed=seed)
+    elif entry is None:
         raise UsageError(
             "A model is a registry name, FILE.py:FUNCTION, a file of activations, a mapping of activations or a "
             f"torch.nn.Module; received {type(model).__name__}."
         )
-    elif (":" in model and not model.startswith(PREFIXES)) or model.endswith(".py"):
-        module = unwrapped(load_user_model(model, seed=seed))
-        card = ModelCard(model, family="user module", seed=seed)
     else:
-        entry = locate_model(model)
         module = entry.build(seed)
         count = getattr(module, "multiply_adds", None)
         card = ModelCard(

@@ -114,11 +114,12 @@ def score_record(
     benchmark = with_benchmark(options, changes)
     options = _options(model, options if benchmark is None else benchmark.options)
     plan = None if options.plan is None else SealedPlan.read(options.plan)
-    _prepare(model, options, progress)
     # Whatever can be wrong with a name or a file is found before the slow part, the simulation.
     metric = metric_of(options)
     options = replace(options, metric=metric)
+    _prepare(model, options, progress)
     resolved = resolve_model(model, seed=options.model_seed)
+    resolved.committed(options)
     stage_done()
     brain = open_neural_responses(options.recordings, progress=progress, **options.selection)
     brain = replace(brain, title=options.title, covariates=metric.of_covariates)

@@ -57,3 +57,12 @@ def test_no_more_is_imported_than_the_command_that_is_asked_for(words: list[str]
     code = f"import sys; from brainbench.cli.application import build; build({words!r})"
     found = {name.split(".")[2] for name in _all_modules_after(code) if name.startswith("brainbench.cli.")}
     assert found & set(COMMAND_HELP) == {*words} & set(COMMAND_HELP)
+
+
+@pytest.mark.parametrize(
+    "words", [["score", "zhang-small"], ["export", "zhang-small"], ["train", "zhuang-small", "--data", "none"]]
+)
+def test_a_wrong_name_is_told_before_pytorch_is_imported(words: list[str]):
+    code = f"import contextlib, sys; from brainbench.cli import main; sys.argv[1:] = {words!r}\n"
+    modules = _all_modules_after(f"{code}with contextlib.suppress(SystemExit): main()")
+    assert "torch" not in modules

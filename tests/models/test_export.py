@@ -207,6 +207,12 @@ def test_a_file_that_differs_is_not_kept(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_name_of_the_other_format_is_refused(tmp_path):
+    with pytest.raises(UsageError, match=r"is named as a file of the format 'torch', not 'onnx'"):
+        export_model(load_model("resnet18-small"), tmp_path / "model.pt2")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_an_unknown_format_is_refused(tmp_path):
     with pytest.raises(UsageError, match=r"'onxx'.*'onnx'"):
         export_model(load_model("resnet18-small"), tmp_path / "model", format="onxx")

@@ -353,6 +353,19 @@ def test_a_layer_can_be_committed_to_and_a_typo_is_corrected(truth: Path, record
         score_record(str(truth), recordings=recordings, layer="othr")
 
 
+@pytest.mark.parametrize("choice", [{"layer": "fcc"}, {"layers": ("fc", "fcc")}, {"layer": "fcc[0]"}])
+@pytest.mark.parametrize("named", [False, True])
+def test_a_layer_that_a_network_does_not_have_is_told_before_recordings_are_read(tmp_path: Path, choice, named):
+    class Named(_Tiny):
+        layers = ("fc",)
+
+        def activations(self, x, layers):
+            return {"fc": self(x)}
+
+    with pytest.raises(UsageError, match=r"Unknown layer 'fcc.*did you mean 'fc'"):
+        score_record(Named() if named else _Tiny(), recordings=str(tmp_path / "none.nwb"), **choice)
+
+
 def test_unreliable_units_can_be_left_out_and_are_counted(truth: Path, recordings: xr.Dataset):
     every = brainbench.score(str(truth), recordings=recordings)
     some = brainbench.score(str(truth), recordings=recordings, units_reliability=0.9)

@@ -10,7 +10,7 @@ import typer
 
 from brainbench.cli.options import out_file_option, out_folder_option
 from brainbench.cli.output import Output, progress_bar, table_of
-from brainbench.core.errors import visible
+from brainbench.core.errors import DataError, visible
 
 if TYPE_CHECKING:
     from leaderboards.store import StoredRecord
@@ -31,10 +31,12 @@ def build(
     from leaderboards.store import read_records
 
     stored = read_records(records or [RECORDS], light=True)
-    with progress_bar("building the pages"):
-        page = build_leaderboard(stored, out, title=title)
     problems = _problems(stored)
     good = len(stored) - len(problems)
+    if not good:
+        raise DataError(f"None of these records can be read, so no board is written.{_left_out(problems)}")
+    with progress_bar("building the pages"):
+        page = build_leaderboard(stored, out, title=title)
     text = f"{page}  ({good} records, {len(problems)} with problems){_left_out(problems)}"
     if show and not webbrowser.open(page.resolve().as_uri()):
         typer.echo("No browser could be opened here; open the file above.", err=True)

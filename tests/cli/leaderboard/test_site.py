@@ -71,6 +71,15 @@ def test_the_leaderboard_of_no_records_says_how_to_get_some(run, tmp_path):
     assert "brainbench score" in result.err
 
 
+def test_of_records_that_cannot_be_read_no_board_is_written(run, tmp_path):
+    (tmp_path / "broken.json").write_text("{")
+    result = run("leaderboard", "build", str(tmp_path / "broken.json"), "--out", str(tmp_path / "page"))
+    assert result.status == 1
+    assert "None of these records can be read" in result.err
+    assert "broken.json" in result.err
+    assert not (tmp_path / "page").exists()
+
+
 ACTS = "\x1b[31mred\x1b[0m\x1b]0;title\x07\u202ex\n::error::y"
 
 
