@@ -143,7 +143,7 @@ def extract(
         run = _Run(model, values, device)
         if readout != "default":
             _read_proven(run, partial(find_readout(readout).activations, model, layers=layers), rooms, chunk)
-        elif is_ours(model):
+        elif proof.is_ours(model):
             _read_proven(run, named_reader(model, layers), rooms, chunk)
         else:
             _ForeignReader(run, layers, rooms).read(chunk)
@@ -165,19 +165,10 @@ def find_readout(name: str) -> Any:
     return readout
 
 
-def named_layers(model: nn.Module) -> tuple[str, ...] | None:
-    """Return the layers that a model names, which its method ``activations`` gives; None for any other module.
-
-    An attribute ``layers`` alone, such as a list of modules, names none.
-    """
-    names = getattr(model, "layers", None)
-    if not isinstance(names, tuple) or not all(isinstance(name, str) for name in names):
-        return None
-    return names if callable(getattr(model, "activations", None)) else None
-
-
 def named_reader(model: Any, layers: Collection[str] | None) -> Any:
     """Return a function from stimuli to activations if the model names its layers itself."""
+    from brainbench.models.proof import named_layers
+
     if (names := named_layers(model)) is None:
         return None
     check_each("layer", layers or (), names)
@@ -185,28 +176,25 @@ def named_reader(model: Any, layers: Collection[str] | None) -> Any:
     return lambda part: model.activations(part, wanted)
 
 
-def check_layers(model: nn.Module, layers: Iterable[str]) -> None:
-    """Raise UsageError unless a model has layers, or parts, of these names; calls of a part are ``part[0]``, …."""
-    choices = _choices(model)
-    check_each("layer", sorted({_part_name(layer, choices) for layer in layers}), choices)
+def check_layers(model: Any, layers: Iterable[str]) -> set[str]:
+    """Return layers or parts by name, without the number of a call, such as ``part[0]``; UsageError for unknown ones.
+
+    ``model`` is a module, or the names of layers.
+    """
+    choices = _choices(model) if callable(model) else model
+    names = {layer if layer in choices else layer.partition("[")[0] for layer in layers}
+    check_each("layer", sorted(names), choices)
+    return names
 
 
-def _choices(model: nn.Module) -> dict[str, nn.Module]:
+def _choices(model: Any) -> dict[str, Any]:
     """Return what may be asked for of a model: the layers that it names, or else its parts and its output."""
+    from brainbench.models.proof import named_layers
+
     if (names := named_layers(model)) is not None:
         return dict.fromkeys(names, model)
     parts = {name.replace("_orig_mod.", ""): part for name, part in model.named_modules() if name}
     return {**parts, OUTPUT: parts.get(OUTPUT, model)}
-
-
-def _part_name(layer: str, choices: Collection[str]) -> str:
-    return layer if layer in choices else layer.partition("[")[0]
-
-
-def is_ours(model: nn.Module) -> bool:
-    """Return whether a model names its layers and is made of our parts alone, whose layers our tests prove."""
-    packages = {type(part).__module__.partition(".")[0] for part in model.modules()}
-    return named_layers(model) is not None and packages <= {"brainbench", "torch"}
 
 
 @contextmanager
@@ -478,8 +466,7 @@ class _ForeignReader:
         choices = _choices(model)
         if self.layers is None:
             return choices if self.named else {**proof.layer_modules(model), OUTPUT: model}
-        check_layers(model, self.layers)
-        wanted = {_part_name(layer, choices) for layer in self.layers}
+        wanted = check_layers(model, self.layers)
         return {name: part for name, part in choices.items() if name in wanted}
 
     def read(self, chunk: int) -> None:

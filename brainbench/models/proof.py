@@ -295,6 +295,23 @@ def unwrapped(model: Any) -> Any:
     return getattr(model, "_orig_mod", model)
 
 
+def named_layers(model: nn.Module) -> tuple[str, ...] | None:
+    """Return the layers that a model names, which its method ``activations`` gives; None for any other module.
+
+    An attribute ``layers`` alone, such as a list of modules, names none.
+    """
+    names = getattr(model, "layers", None)
+    if not isinstance(names, tuple) or not all(isinstance(name, str) for name in names):
+        return None
+    return names if callable(getattr(model, "activations", None)) else None
+
+
+def is_ours(model: nn.Module) -> bool:
+    """Return whether a model names its layers and is made of our parts alone, whose layers our tests prove."""
+    packages = {type(part).__module__.partition(".")[0] for part in model.modules()}
+    return named_layers(model) is not None and packages <= {"brainbench", "torch"}
+
+
 def layer_modules(model: nn.Module) -> dict[str, nn.Module]:
     """Return the parts that count as layers: those without parts, and those with weights of their own.
 

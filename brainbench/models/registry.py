@@ -376,7 +376,7 @@ class ModelSize:
 
 def measure(located: LocatedModel) -> ModelSize:
     """Count a network's parameters and multiply-adds."""
-    from brainbench.models.activations import named_layers
+    from brainbench.models.proof import named_layers
 
     model = located.outline()
     count: Callable[[], int] | None = getattr(model, "multiply_adds", None)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.core.contracts import CHANNELS
-from brainbench.core.errors import UsageError, check_each, unknown_name
+from brainbench.core.errors import UsageError, check_each
 from brainbench.core.files import file_hash
 from brainbench.core.progress import Progress
 from brainbench.core.reading.regular import readable
@@ -115,9 +115,9 @@ class ResolvedModel:
 
     def committed(self, options: ScoreOptions) -> ModelCard:
         """Return the card with the layer that is committed to; options that do not suit the model are refused."""
-        from brainbench.models.activations import check_layers, find_readout, named_layers
+        from brainbench.models.activations import check_layers, find_readout
 
-        card, layers = self.card, options.layers or ()
+        card, names = self.card, self.activations
         if not options.normalize and (self.module is None or _has_contract(self.module)):
             reads = "was computed elsewhere" if self.module is None else "normalises SI values by itself"
             raise UsageError(f"normalize=False gives SI values to plain modules; {card.name!r} {reads}: leave it out.")
@@ -126,23 +126,18 @@ class ResolvedModel:
                 raise UsageError("The published readout needs a network; these are features computed elsewhere.")
             # A committed layer goes by our names; theirs are other arrays, so only the caller can commit to one.
             card, names = replace(card, layer=None), find_readout(options.readout).layers(self.module)
-        else:
-            names = self.activations if self.module is None else named_layers(self.module)
         card = replace(card, layer=options.layer or card.layer)
-        if names is not None:
-            check_each("layer", layers, names)
-        elif self.module is not None:
-            check_layers(self.module, filter(None, (*layers, card.layer)))
-        if card.layer is not None and (choices := layers or names) and card.layer not in choices:
-            raise unknown_name("layer", card.layer, choices)
+        check_layers(self.module if names is None else names, filter(None, (*(options.layers or ()), card.layer)))
+        if card.layer is not None and options.layers:
+            check_each("layer", [card.layer], options.layers)
         return card
 
     def respond(self, options: ScoreOptions, *, progress: Progress | None = None) -> ModelResponses:
         """Run the model on the stimuli, or take the features that were computed elsewhere."""
-        from brainbench.models.activations import extract, is_ours
+        from brainbench.models.activations import extract
+        from brainbench.models.proof import is_ours
 
-        card, simulated = self.committed(options), None
-        labels, origin, model_input = self.labels, self.origin, None
+        card, labels, origin, simulated, model_input = self.committed(options), self.labels, self.origin, None, None
         if labels is None:
             from brainbench.stimuli import load_stimuli
 

@@ -18,7 +18,8 @@ from torch import nn
 from torch.nn import functional
 
 from brainbench.core.errors import UsageError
-from brainbench.models.activations import extract, is_ours, named_layers
+from brainbench.models.activations import extract
+from brainbench.models.proof import is_ours, named_layers
 from brainbench.models.registry import load_model
 
 K, T = 5, 4

@@ -26,6 +26,7 @@ from brainbench.core.errors import (
     DataFileNotFoundError,
     UsageError,
     brief,
+    check_kind,
     check_name,
     check_number,
     listing,
@@ -128,6 +129,8 @@ def read_manifest(folder: Path) -> Mapping[str, Any]:
                 raise DataError(f"{name!r} in {str(path)!r} is no {kind.__name__}; received {brief(manifest[name])}.")
         for entry in (*manifest["splits"].values(), *manifest["shards"]):
             check_number(f"'sweeps' in {str(path)!r}", entry["sweeps"], least=0, whole=True)
+        for name, entry in manifest.get("objects", {}).items():
+            check_kind(f"hash of the object {brief(name)}", entry["hash"], str, "a text")
         for entry in manifest["shards"]:
             # A name with a folder in it could lead out of the data set.
             plain = Path(entry["name"]).name == entry["name"] and isinstance(entry["content_hash"], str)
@@ -375,14 +378,18 @@ class WhiskingDataset:
     def summary(self) -> dict[str, Any]:
         """Hash, number of classes, and the sweeps of each split that are used and in all left out: for a card.
 
-        Time steps [s] and axes are told where they are not the usual ones.
+        Time steps [s] and axes are told where they are unusual, and how many test sweeps are of objects trained on.
         """
         step, default_step = self.substeps * self._shards[0].interval, SUB_STEPS * SUB_STEP_SECONDS
         unusual: dict[str, Any] = {} if np.isclose(step, default_step, rtol=1e-6) else {"time_step": step}
         if self.axes != "world":
             unusual["axes"] = self.axes
-        used = self._splits[self._where].tolist()
-        sizes = {name: used.count(name) for name in SPLITS[:3]}
+        used = self._splits[self._where]
+        sizes = {name: int((used == name).sum()) for name in SPLITS[:3]}
+        hashes = {name: entry["hash"] for name, entry in self.manifest.get("objects", {}).items()}
+        shapes = np.array([hashes.get(name, name) for name in self.objects.tolist()])
+        if repeated := int(np.isin(shapes[used == "test"], shapes[used == "train"]).sum()):
+            unusual["test_of_trained_objects"] = repeated
         about = {"hash": self.manifest["content_hash"], "classes": len(self.classes), "left_out": self.skipped}
         return {**about, **sizes, **unusual}
 

@@ -24,6 +24,7 @@ from brainbench.models.recipes import (
     is_path,
     recipe_for,
 )
+from brainbench.models.registry import locate_model
 from brainbench.models.training.checkpoints import DType
 
 _Times = Annotated[int, Limit(least=0, most=2**31 - 1)]
@@ -77,6 +78,7 @@ class TrainingConfig:
     @classmethod
     def published(cls, model: str, objective: str = "supervised", **changes: Any) -> TrainingConfig:
         """Return the published recipe of an architecture and an objective, with changes."""
+        check_start(model)
         objective, _, variant = objective.partition("-")
         recipe = recipe_for(model, objective)
         setting = recipe.setting
@@ -106,6 +108,16 @@ class TrainingConfig:
         version = 1 if is_path(self.model) else Architecture.parse(self.model).version
         # A run that was begun before its architecture changed must not go on with the new one.
         return stated if version == 1 else stated | {"version": version}
+
+
+def check_start(model: str) -> None:
+    """Raise UsageError unless a name is that of an untrained model, which training starts from and is compared with."""
+    located = locate_model(model)
+    if located.trained is not None or located.architecture.tag is not None:
+        raise UsageError(
+            f"Training starts from new weights, and {model!r} names trained ones: train "
+            f"{located.architecture.untrained!r}."
+        )
 
 
 def config_warnings(config: TrainingConfig, model: Any) -> list[str]:

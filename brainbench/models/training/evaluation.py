@@ -359,13 +359,17 @@ def model_card(config: TrainingConfig, info: Mapping[str, Any]) -> str:
     """Return the text of the model card (Mitchell et al. 2019), in Markdown."""
     model = describe_model(config.model)
     evaluation, data = info["evaluation"], info.get("data")
+    repeated = (data or {}).get("test_of_trained_objects", 0)
+    tested = (
+        f"to test, {repeated:,} of them of objects that were trained on" if repeated else "of other objects to test"
+    )
     rows = {
         "architecture": f"{config.model} ({model.citation})",
         "parameters": f"{model.parameters:,} with 117 classes; {len(info['classes'])} classes here",
         "input": "sweeps [B, T, 30, 5, 7] in N and N·m; normalised inside",
         "data": data
         and f"{data['hash']}: {data['train']:,} sweeps to train, {data['validation']:,} to validate, "
-        f"{data['test']:,} of other objects to test; {data['left_out']:,} left out as unstable",
+        f"{data['test']:,} {tested}; {data['left_out']:,} left out as unstable",
         "epochs": f"{info['epochs']} (published: {info['published_epochs']}); best: {info['best_epoch']}",
         "optimiser": f"{config.optimizer}, {config.schedule}, learning rate {config.learning_rate:g}, batch "
         f"{config.batch_size}, gradients clipped to a norm of {config.clip:g}, {config.precision}",

@@ -32,7 +32,7 @@ from brainbench.models.ops.layers import seeded
 from brainbench.models.registry import load_model
 from brainbench.models.training.batches import MOUSE, Augmentation, Batches, BatchOptions, Data, Processes, processes
 from brainbench.models.training.checkpoints import WEIGHTS, load_weights, save_checkpoint
-from brainbench.models.training.config import TrainingConfig, config_warnings
+from brainbench.models.training.config import TrainingConfig, check_start, config_warnings
 from brainbench.models.training.evaluation import (
     CONTROLS,
     TWIN,
@@ -126,6 +126,7 @@ class _Run:
     def __init__(
         self, config: TrainingConfig, data: Data, out: Path, where: Processes, progress: Progress | None, controls: Path
     ) -> None:
+        check_start(config.model)
         if config.precision == "auto":
             config = replace(config, precision="bf16" if where.device.type == "cuda" else "float32")
         self.config, self.data, self.out, self.where = config, data, out, where
@@ -297,7 +298,8 @@ class _Run:
                 # The same views in every epoch, so that losses can be compared.
                 views = self._views(x, -1 - index)
                 if len(x) > 1 or self.config.objective not in _OF_SEVERAL:
-                    total, count = total + float(self.learner(views, labels)), count + 1
+                    # Each sweep counts alike, also where the last batch is short.
+                    total, count = total + len(x) * float(self.learner(views, labels)), count + len(x)
         if not count:  # as without a validation: nothing can be compared
             return loss
         mean = self.where.mean(total / count)
@@ -335,6 +337,9 @@ class _Run:
             if result is not None and split != "test":
                 advice = "There is no split 'test': the accuracy is that of %s sweeps, which chose the weights."
                 _log.warning(advice, split)
+            if repeated := self.data.summary.get("test_of_trained_objects"):
+                advice = "%d test sweeps are of objects that were trained on: the accuracy counts memory of them too."
+                _log.warning(advice, repeated)
             self._publish(result, split)
             if result is not None:
                 # A run that was killed after this line, and before it is marked as finished, has it already.
@@ -409,10 +414,12 @@ class _Run:
             folder.set_random_state(state["random"], self.where.device)
 
     def _keep_failure(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor, loss: float, norm: float) -> str:
+        advice = "A lower learning rate, a smaller clipping norm or the -ln variant of the network may help"
+        if lost := sum(int((~view.isfinite()).sum()) for view in views):
+            advice = f"{lost:,} values of this batch are not finite (NaN or infinite): leave those out"
         reason = (
             f"at step {self.at.step + 1} the loss was {loss:g} and the gradient's norm {norm:g}; the last good model "
-            f"is kept and the batch is in {FAILED}. A lower learning rate, a smaller clipping norm or the -ln variant "
-            "of the network may help"
+            f"is kept and the batch is in {FAILED}. {advice}"
         )
         if self.where.first:
             tensors = {f"view{index}": view for index, view in enumerate(views)}

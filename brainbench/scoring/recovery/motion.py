@@ -163,7 +163,8 @@ class _Network:
     @classmethod
     def of(cls, model: Any, layer: str) -> _Network:
         """Find a network; the layer is the one it commits to, or else the one asked for."""
-        from brainbench.models.activations import named_layers, named_reader
+        from brainbench.models.activations import named_reader
+        from brainbench.models.proof import named_layers
 
         resolved = resolve_model(model)
         if resolved.module is None:

@@ -57,6 +57,21 @@ def test_unusual_time_steps_and_axes_are_told(folder, copy):
     assert WhiskingDataset(copy).summary["axes"] == "follicle"
 
 
+def test_test_sweeps_of_objects_that_are_trained_on_are_counted_whatever_their_names(folder, copy):
+    whole = WhiskingDataset(folder, split="all")
+    assert "test_of_trained_objects" not in whole.summary
+    trained, tested = (WhiskingDataset(folder, split=split).objects for split in ("train", "test"))
+    manifest = json.loads((copy / "manifest.json").read_text())
+    manifest["objects"][tested[0]]["hash"] = manifest["objects"][trained[0]]["hash"]
+    (copy / "manifest.json").write_text(json.dumps(manifest))
+    count = int((tested == tested[0]).sum())
+    assert WhiskingDataset(copy, split="all").summary == {**whole.summary, "test_of_trained_objects": count}
+    manifest["objects"][tested[0]] = None
+    (copy / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(DataError, match="manifest of a data set"):
+        WhiskingDataset(copy)
+
+
 def test_raw_batches_hold_the_forces_as_stored(plan, folder):
     data = WhiskingDataset(folder, split="test", batch_size=3, view="raw", shuffle=False)
     x, _ = next(iter(data))

@@ -211,6 +211,13 @@ def test_a_card_says_what_was_trained_on_what_and_for_how_long():
     assert "gradients clipped to a norm of 1" in text
 
 
+def test_a_card_says_that_objects_of_the_test_were_trained_on(monkeypatch):
+    monkeypatch.setitem(DATA, "test_of_trained_objects", 12)
+    text = _card(200)
+    assert "407 to test, 12 of them of objects that were trained on; 921 left out" in text
+    assert "other objects" not in text
+
+
 @pytest.mark.parametrize(
     ("correct", "verdict"),
     [(240, "training helped"), (205, "less than these intervals can tell"), (150, "training made it worse")],

@@ -19,7 +19,7 @@ from brainbench.models.training import trainer
 from brainbench.models.training.batches import BatchOptions
 from brainbench.models.training.config import TrainingConfig
 from brainbench.models.training.evaluation import evaluate, fit_probe
-from brainbench.models.training.objectives import make_learner
+from brainbench.models.training.objectives import Learner, make_learner
 from brainbench.models.training.trainer import train
 from brainbench.scoring.model_responses import resolve_model
 from tests.factories.training_sweeps import CLASSES, sweeps, tiny
@@ -104,6 +104,28 @@ def test_a_sweep_alone_has_nothing_to_be_compared_with(tmp_path, objective):
     for name in ("whole", "rest"):
         assert not read_log(tmp_path / name, "validation")
         assert read_log(tmp_path / name, "epoch")[0]["loss"] != pytest.approx(0.0, abs=1e-9)
+
+
+def test_every_sweep_counts_alike_in_a_validation_whose_last_batch_is_short(tmp_path, monkeypatch):
+    class Mean(Learner):
+        def forward(self, views, labels):
+            return 1e4 * views[0].mean() + 0 * sum(parameter.sum() for parameter in self.parameters())
+
+    monkeypatch.setattr(trainer, "make_learner", lambda objective, model: Mean(model))
+    data = tiny(validation=9)
+    train(_config("ae", epochs=1, probe_epochs=0), data, out=tmp_path, device="cpu")
+    expected = 1e4 * float(data.splits["validation"][0].mean())
+    assert read_log(tmp_path, "validation")[0]["loss"] == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("model", ["zhuang-small.simclr", "zhuang-small.ae"])
+def test_training_starts_from_no_trained_weights_which_would_be_its_untrained_twin(tmp_path, model):
+    for begin in (
+        lambda: _config(model=model),
+        lambda: train(TrainingConfig(model, epochs=1), tiny(), out=tmp_path / "run", device="cpu"),
+    ):
+        with pytest.raises(UsageError, match=rf"Training starts from new weights, .*'{model}'.*: train 'zhuang-small'"):
+            begin()
 
 
 def test_an_autoencoder_is_validated_on_every_sweep(tmp_path):
@@ -277,6 +299,7 @@ def test_a_loss_that_is_not_finite_ends_the_run_and_keeps_the_last_good_model(tm
     result = train(_config(epochs=3), data, out=tmp_path, device="cpu")
     assert result.status == "diverged"
     assert "the loss was nan" in result.reason
+    assert f"{x[3].numel():,} values of this batch are not finite (NaN or infinite)" in result.reason
     assert _equal(_weights(tmp_path), good)
     failed = load_file(tmp_path / "failed-batch.safetensors")
     assert torch.isnan(failed["view0"]).any()
