@@ -454,34 +454,39 @@ def _link(temporary: Path, path: Path) -> None:
         temporary.replace(path)
 
 
+_TABLE = 1 << 20  # bytes of the largest write that is held: tables are small, and data are not read again
+
+
 class _Disk(io.FileIO):
     """A file that notes why it cannot be written and says nothing: the library prints and crashes over a full disk.
 
-    It crashes as well where it does not find again what it wrote, so what has no place on disk is kept in memory.
+    What could not be written is held for the library, which crashes too where it reads its tables again as noise.
     """
 
     fault: OSError | None = None
-    _unwritten: tuple[tuple[int, bytes], ...] = ()
+    held: tuple[tuple[int, bytes], ...] = ()
 
     def write(self, data: Any) -> int:
-        rest = memoryview(data).cast("B")
+        rest, place = memoryview(data).cast("B"), self.tell()
         size = len(rest)
         try:
             while len(rest) and self.fault is None:
                 rest = rest[super().write(rest) :]
         except OSError as error:
             self.fault = error
-        self._unwritten += ((self.tell(), bytes(rest)),) if len(rest) else ()
+        if self.fault is not None and size <= _TABLE:
+            self.held += ((place, bytes(data)),)
+        self.seek(place + size)
         return size
 
     def readinto(self, buffer: Any) -> int:
-        place, content = self.tell(), memoryview(buffer).cast("B")
-        size = super().readinto(content) or 0
-        for start, piece in self._unwritten:
-            first, last = max(place, start), min(place + len(content), start + len(piece))
+        view, place = memoryview(buffer).cast("B"), self.tell()
+        count = super().readinto(view)
+        for start, content in self.held:
+            first, last = max(start, place), min(start + len(content), place + len(view))
             if first < last:
-                content[first - place : last - place] = piece[first - start : last - start]
-        return size if self.fault is None else len(content)
+                view[first - place : last - place] = content[first - start : last - start]
+        return count
 
     def truncate(self, size: int | None = None) -> int:
         try:

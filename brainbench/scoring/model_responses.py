@@ -204,7 +204,7 @@ def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
     from brainbench.models.registry import load_user_model, locate_model
     from brainbench.models.training.checkpoints import CONFIG, PREFIXES
 
-    is_code = isinstance(model, str) and (model.endswith(".py") or (":" in model and not model.startswith(PREFIXES)))
+    is_code = isinstance(model, str) and not model.startswith(PREFIXES) and (":" in model or model.endswith(".py"))
     # A name that stands for nothing is told before PyTorch is imported.
     entry = locate_model(model) if isinstance(model, str) and not is_code else None
     import torch

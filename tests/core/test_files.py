@@ -325,6 +325,22 @@ def test_what_has_no_place_on_a_full_disk_is_read_back(tmp_path, little_room):
     assert [*tmp_path.iterdir()] == []
 
 
+def test_what_a_full_disk_did_not_take_is_read_back_by_the_library(tmp_path, little_room):
+    path = tmp_path / "a"
+    path.touch()
+    with files._Disk(path, "r+") as disk:
+        for content in (b"a" * 90_000, b"b" * 20_000):
+            assert disk.write(content) == len(content)
+        disk.seek(105_000)
+        disk.write(b"c" * 10)
+        assert disk.tell() == 105_010
+        assert disk.fault is not None
+        disk.seek(89_000)
+        buffer = bytearray(21_000)
+        disk.readinto(buffer)
+    assert buffer == b"a" * 1_000 + b"b" * 15_000 + b"c" * 10 + b"b" * 4_990
+
+
 def test_nul_in_a_text_is_refused_in_words(tmp_path):
     with pytest.raises(DataError, match="NUL"), create_hdf5(tmp_path / "a.h5") as file:
         file.create_dataset("a", data=["a\0b"], dtype=h5py.string_dtype())

@@ -9,7 +9,7 @@ import xarray as xr
 from torch import nn
 
 import brainbench
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import DataFileNotFoundError, UsageError
 from brainbench.core.records import ModelCard
 from brainbench.models.registry import load_model
 from brainbench.scoring.model_responses import ModelResponses, contact_kinematics, resolve_model
@@ -102,6 +102,11 @@ def test_a_lazy_layer_without_weights_is_named():
         UsageError, match=r"Sequential has lazy layers without weights yet \(1\.weight, 1\.bias\): run it"
     ):
         brainbench.score(nn.Sequential(nn.Flatten(), nn.LazyLinear(3)))
+
+
+def test_a_prefix_of_trained_weights_is_never_code():
+    with pytest.raises(DataFileNotFoundError, match=r"There is no folder 'mine\.py'"):
+        resolve_model("local-dir:mine.py")
 
 
 def test_other_things_are_no_models():
