@@ -27,7 +27,7 @@ it; ``undefined``: no number exists. The reason stands in words beside it."""
 
 RECORD_SCHEMA: Literal[2] = 2  # version of the result-record JSON layout
 
-ESTIMATOR_VERSION = 4
+ESTIMATOR_VERSION = 5
 """Raised whenever the same recordings and activations would get another number from the default estimator."""
 
 _ROUNDING = 1e-6

@@ -144,8 +144,9 @@ class MetricHooks:
         return None
 
     def partner(self, animal: SubjectRDM, others: Sequence[SubjectRDM]) -> Any:
-        """Return the layer that an animal is compared with: the others' units side by side, as if they were one."""
-        return np.concatenate([other.patterns for other in others], axis=1)
+        """Return the layer that an animal is compared with: the others' units side by side, whatever their scale."""
+        centred = [other.patterns - other.patterns.mean(axis=0) for other in others]
+        return np.concatenate([patterns / (np.linalg.norm(patterns) or 1.0) for patterns in centred], axis=1)
 
     def agreement(self, animal: SubjectRDM, others: Sequence[SubjectRDM], estimator: str) -> Corrected:
         """Return the factor that corrects the comparison of an animal with others."""

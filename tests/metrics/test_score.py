@@ -398,6 +398,18 @@ def test_each_animal_meets_the_mean_of_the_others_and_both_are_corrected():
     assert score.status == "ok"
 
 
+@pytest.mark.parametrize("name", ["rsa", "rsa-correlation", "rsa-crossnobis", "cka", "procrustes", "ridge"])
+def test_an_animal_with_larger_responses_decides_no_more_than_others(name):
+    metric, values = get_metric(name), []
+    for scale in (1.0, 64.0):
+        blocks = [make_block(make_latent(0), seed=seed, units=30) for seed in range(4)]
+        blocks[0] = replace(blocks[0], responses=blocks[0].responses * scale)
+        animals = [metric.animal(f"m{index}", [block], 6) for index, block in enumerate(blocks)]
+        values.append(metric.score_animals(animals, stimuli=STIMULI))
+    assert values[1].value == pytest.approx(values[0].value, rel=1e-6)
+    assert values[1].p == values[0].p
+
+
 def test_animals_that_share_a_geometry_agree_fully_after_correction():
     # Tuning is drawn anew per animal, so many units are needed before the geometry itself is shared.
     animals = [

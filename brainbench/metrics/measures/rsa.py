@@ -376,14 +376,14 @@ class RSA(Metric):
         return [replace(animal, rdm=half, halves=half[:0]) for half in halves], factor
 
     def partner(self, animal: SubjectRDM, others: Sequence[SubjectRDM]) -> Floats:
-        """Return the mean RDM of the other animals."""
-        return np.mean([other.rdm for other in others], axis=0)
+        """Return the mean RDM of the other animals, whatever the size of their responses."""
+        return np.mean([other.rdm / _size(other) for other in others], axis=0)
 
     def agreement(self, animal: SubjectRDM, others: Sequence[SubjectRDM], estimator: str) -> Corrected:
         """Return the factor for both sides (thesis, equation 3.4): the others' mean RDM is noisy too."""
         # Halves are averaged split by split, so every animal must have them.
         splits = min(len(one.halves) for one in others)
-        halves = reduce(np.add, [one.halves[:splits] for one in others]) / len(others)
+        halves = reduce(np.add, [one.halves[:splits] / _size(one) for one in others]) / len(others)
         if estimator == "default":
             mean = replace(others[0], rdm=self.partner(animal, others), halves=halves, comparison="")
             return correction_by(animal.reliability_by(self.comparison), mean.reliability_by(self.comparison))
@@ -398,7 +398,7 @@ class RSA(Metric):
         """Return the mean corrected agreement [N] with every animal's stimuli in an order of its own [N, A, K]."""
         if self.comparison not in LINEAR:
             return super().agreement_null(animals, factors, orders)
-        rdms = np.stack([animal.rdm for animal in animals])
+        rdms = np.stack([animal.rdm / _size(animal) for animal in animals])
         return _linear_agreement(squares(LINEAR[self.comparison](rdms), self.comparison), factors, orders)
 
     def unique(
@@ -415,6 +415,14 @@ class RSA(Metric):
         # Boards and audits tell metrics apart by these words.
         noise = "" if self.noise == "none" else f" divided by noise ({self.noise})"
         return f"RSA: {'/'.join(methods)} RDM{noise}, {self.comparison} comparison"
+
+
+def _size(animal: SubjectRDM) -> float:
+    """Return what an RDM is divided by before animals are averaged; correlation distances have a scale already.
+
+    Squared distances grow with rates and with the number of units, so that one animal would decide.
+    """
+    return 1.0 if animal.method == "correlation" else float(np.linalg.norm(animal.rdm)) or 1.0
 
 
 def _linear_agreement(matrices: Floats, factors: Floats, orders: Ints) -> Floats:
