@@ -199,7 +199,7 @@ def checker(annotation: Any, limit: msgspec.Meta | None = None) -> Check | None:
     if origin in (tuple, list, Sequence) and (limit is None or sized):
         return _values(origin is tuple and kinds[-1:] != (Ellipsis,), kinds, limit or Limit())
     if annotation is str:
-        return None if limit is None else lambda name, value: _check_length(name, value, limit, "characters")
+        return None if limit is None else lambda name, value: _check_text(name, value, limit)
     if limit is not None:
         raise TypeError(f"Limits stand behind a number, a text or a tuple, not behind {annotation}: {limit}.")
     if annotation is bool:
@@ -275,6 +275,12 @@ def _values(fixed: bool, kinds: Sequence[Any], limit: msgspec.Meta) -> Check | N
             raise UsageError(f"{name} is a range (low, high); received {brief(value)}.")
 
     return check
+
+
+def _check_text(name: str, value: Any, limit: msgspec.Meta) -> None:
+    if not isinstance(value, str):
+        raise UsageError(f"{name} must be a text; received {brief(value)}.")
+    _check_length(name, value, limit, "characters")
 
 
 def _check_length(name: str, value: Any, limit: msgspec.Meta, noun: str) -> None:

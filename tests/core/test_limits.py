@@ -65,6 +65,8 @@ def _bad_values(annotation: Any, limit: msgspec.Meta | None = None) -> Iterator[
     elif annotation is bool:
         yield "yes"
     elif annotation is str and limit is not None:
+        # A list has a length too.
+        yield from (3, 2.5, ["x"])
         yield from ("x" * size for size in [(limit.min_length or 0) - 1, (limit.max_length or -2) + 1] if size >= 0)
     elif annotation in (int, float):
         yield "text"
