@@ -25,6 +25,7 @@ from robotics_bridge.sensors.runtime import History, Runtime, SuiteContext
 from robotics_bridge.sensors.sensor import ProbeSensor, Sensor, SensorFidelity
 from robotics_bridge.sensors.temperature.grid import TemperatureGrid
 
+FARTHEST = 20.0  # distance of a sensor's link from the origin of the world (m) from which on depths are off by some µm
 LARGEST = 3.0
 """Radius (m) around the probes of one sensor, or around a touched mesh, above which numbers look like millimetres."""
 WIDEST = 0.3  # sensing radius (m) of a taxel above which it does, if it also exceeds the patch of its sensor
@@ -55,6 +56,8 @@ def warn_of(scene: TouchScene, sensors: Mapping[str, Sensor]) -> None:
             doubts.append((f"the sensing radius of {name!r}", f"{widest:g} m"))
         if isinstance(sensor, ContactProbe) and sensor.threshold > DEEPEST:
             doubts.append((f"the threshold of {name!r}", f"{sensor.threshold:g} m"))
+        if (gap := _gap(scene, sensor.link, sensor.probes)) > LARGEST:
+            doubts.append((f"the probes of {name!r}", f"{gap:g} m from their own link"))
     if doubts:
         what, size = doubts[0]
         _warn(f"{what[:1].upper()}{what[1:]}: {size}. Lengths are in metres; scale millimetres by 1e-3.")
@@ -66,6 +69,16 @@ def warn_of(scene: TouchScene, sensors: Mapping[str, Sensor]) -> None:
                 f"{buried} of {len(sensor.probes)} probes of {name!r} lie deeper inside their own link {sensor.link!r} "
                 "than their sensing radius, so that nothing can touch them; place them on its surface."
             )
+
+
+def _gap(scene: TouchScene, link: str, probes: Probes) -> float:
+    """Return how far (m) at least the middle of probes lies from the nearest solid of their link; 0 without any."""
+    gaps = []
+    for geometry in (scene.geometries[g] for g in scene.geometries_of(link)):
+        local = (enclosing_sphere(probes)[0] - geometry.position) @ to_matrices(geometry.quaternion)
+        away = float(np.linalg.norm(local))
+        gaps.append(away - float(geometry.reach(local / max(away, 1e-9))))
+    return min(gaps, default=0.0)
 
 
 def _warn(text: str) -> None:
@@ -385,6 +398,16 @@ class SensorSuite:
             )
         if str(state.device) != str(self.device):
             raise UsageError(f"The state lies on {state.device}, the suite on {self.device}; build both on one device.")
+        links = [self.scene.link_index(sensor.link) for sensor in self.sensors.values()]
+        if self._pose is None and links and not self.device.is_capturing:
+            far = float(state.pose_torch[:, links, :3].abs().nan_to_num(0.0, 0.0, 0.0).max())
+            if far > FARTHEST:
+                warnings.warn(
+                    f"Links with sensors lie up to {far:.3g} m from the origin of the world, where single precision "
+                    f"tells depths to some {0.06 * far:.2g} µm only: keep hand and objects within ten metres of it.",
+                    RuntimeWarning,
+                    stacklevel=3,
+                )
 
     def runtime_of(self, name: str, kind: type[Sensor] = Sensor, what: str = "sensor") -> Runtime:
         """Return the runtime of a sensor of a kind, which messages call ``what``."""

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from brainbench.core.errors import UsageError, brief, check_number, check_numbers
 from brainbench.geometry import Mesh
 
-FARTHEST = 10.0  # distance [m] from its link beyond which no probe is, and largest radius
+WIDEST = 10.0  # largest extent of the probes of a sensor along an axis, and largest radius [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +47,8 @@ class Probes:
             raise UsageError(f"{count} positions do not go with {len(normal)} normals in the shape {shape}.")
         if not (np.isfinite(position).all() and np.isfinite(normal).all() and np.isfinite(radius).all()):
             raise UsageError("Positions, normals and radii of probes must be finite numbers.")
-        if max(np.abs(position).max(), radius.max()) > FARTHEST:
-            raise UsageError(f"Positions and radii of probes are in m, at most {FARTHEST:g}; write metres, not mm.")
+        if max(np.ptp(position, axis=0).max(), radius.max()) > WIDEST:
+            raise UsageError(f"Probes extend over {WIDEST:g} m at most, and so do their radii; write metres, not mm.")
         if (radius < 0).any():
             raise UsageError(f"The radius of a probe is positive, or 0 for a filler; received {radius.min():g} m.")
         if self.pitch is not None:
@@ -170,9 +170,13 @@ def _vectors(name: str, values: ArrayLike) -> NDArray[np.float64]:
 def _check_pitch(position: NDArray[np.float64], shape: tuple[int, ...], pitch: tuple[float, float]) -> None:
     """Raise UsageError unless the probes [rows, columns] form the regular planar grid that a pitch (m) promises."""
     grid = position.reshape(*shape, 3) if len(shape) == 2 else position[None]
-    for axis, step in enumerate(pitch):
-        way = np.diff(grid, axis=axis)
-        if way.size and not (np.allclose(way, way[0, 0], atol=1e-9) and math.isclose(np.linalg.norm(way[0, 0]), step)):
+    ways = [np.diff(grid, axis=axis).reshape(-1, 3) for axis in range(2)]
+    first = np.array([way[0] if len(way) else np.zeros(3) for way in ways])
+    # Rows that lean (a grid of rhombs) are no product of two axes.
+    lean = abs(first[0] @ first[1]) > 1e-6 * math.prod(np.linalg.norm(first, axis=1))
+    for way, start, step in zip(ways, first, pitch, strict=True):
+        even = np.allclose(way, start, atol=1e-9) and math.isclose(np.linalg.norm(start), step)
+        if len(way) and (lean or not even):
             raise UsageError(f"A pitch {tuple(pitch)} m promises a regular grid, which these {len(position)} probes "
                              "do not form; use Probes.grid, or leave the pitch out.")  # fmt: skip
 

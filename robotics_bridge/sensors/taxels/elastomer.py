@@ -196,7 +196,11 @@ def _axes(sensor: ElastomerTaxel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             along = np.cross(corners[-1, 0] - corners[0, 0], normal)
     along = along - normal * (along @ normal)
     along = along / max(float(np.linalg.norm(along)), 1e-12)
-    return along, np.cross(normal, along), normal
+    across = np.cross(normal, along)
+    if len(probes.shape) == 2 and (corners[-1, 0] - corners[0, 0]) @ across < 0:
+        # Rows of a mirrored grid, or of one that is counted from the top, grow the other way.
+        across = -across
+    return along, across, normal
 
 
 def _spectrum(sensor: ElastomerTaxel, device: Any) -> tuple[tuple[int, int], Any]:

@@ -280,6 +280,18 @@ def test_taxels_of_a_mesh_that_is_inside_out_face_outward(tmp_path):
         np.testing.assert_allclose(layout[link].normal, probes.normal, atol=1e-6)
 
 
+def test_a_hand_whose_frame_lies_far_from_its_solids_gets_all_taxels(tmp_path):
+    far = tmp_path / "far.xml"
+    text = MENAGERIE_LIKE.replace('name="palm" pos="0 0 0.1"', 'name="palm" pos="-12 0 0.1"')
+    text = text.replace('<geom name="palm_geom"', '<geom name="palm_geom" pos="12 0 0"')
+    far.write_text(text.replace('pos="0 0.03 0.05"', 'pos="12 0.03 0.05"').replace('pos="0 -0.03', 'pos="12 -0.03'))
+    near = tmp_path / "near.xml"
+    near.write_text(MENAGERIE_LIKE)
+    layout, plain = (hands.load(path).layout("low") for path in (far, near))
+    assert list(layout) == list(plain)
+    np.testing.assert_allclose(layout["palm"].position - [12, 0, 0], plain["palm"].position, atol=1e-9)
+
+
 def test_fingers_that_begin_inside_the_palm_move_and_feel_nothing_of_it(tmp_path):
     hand = hands.load(_box_hand(tmp_path, root=0.03))
     assert hand.nested == {("palm", "index"), ("palm", "thumb")}

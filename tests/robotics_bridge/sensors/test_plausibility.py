@@ -12,7 +12,7 @@ from brainbench.geometry import Mesh
 from robotics_bridge import hands
 from robotics_bridge.physics import Geometry, TouchScene
 from robotics_bridge.sensors import ContactDepthProbe, Probes, SensorSuite
-from tests.factories.touch_scenes import pad_scene
+from tests.factories.touch_scenes import pad_scene, poses_at, state_of
 
 BALL = Geometry(name="o", link="o", kind="sphere", size=(0.01,))
 ON_TOP = Probes.grid(3, 3, size=(0.01, 0.01), center=(0, 0, 0.005), radius=0.001)
@@ -30,6 +30,26 @@ def test_lengths_in_millimetres_are_said() -> None:
     cup = trimesh.creation.icosphere(2, 40)
     with pytest.warns(RuntimeWarning, match="'cup'.*metres"):
         _suite(Geometry(name="o", link="o", kind="mesh", mesh=Mesh(cup.vertices, cup.faces, "cup")), ON_TOP)
+
+
+def test_probes_far_from_the_solids_of_their_link_are_said() -> None:
+    with pytest.warns(RuntimeWarning, match="'tip': 5.99. m from their own link.*metres"):
+        _suite(BALL, Probes.grid(3, 3, size=(0.01, 0.01), center=(0, 0, 6), radius=0.004))
+    table = Geometry(name="p", link="hand", kind="box", size=(8.0, 8.0, 0.005))
+    with warnings.catch_warnings(action="error"):
+        probes = {"tip": ContactDepthProbe(link="hand", probes=Probes([[7, 7, 0.005]], [[0, 0, 1.0]], 0.004))}
+        SensorSuite(TouchScene(("hand", "o"), (table, BALL)), probes, num_envs=1)
+
+
+@pytest.mark.parametrize(("place", "warned"), [(10.0, 0), (100.0, 1)])
+def test_hands_far_from_the_origin_of_the_world_are_said_once(place: float, warned: int) -> None:
+    suite, scene = _suite(BALL, ON_TOP), pad_scene(BALL)
+    state = state_of(scene, poses_at(3, {1: (place, 0, 0), 2: (place, 0, 0.0145)}))
+    with warnings.catch_warnings(record=True) as messages:
+        warnings.simplefilter("always")
+        suite.update(state)
+        suite.update(state)
+    assert ["to some 6 µm" in str(message.message) for message in messages] == [True] * warned
 
 
 @pytest.mark.parametrize(

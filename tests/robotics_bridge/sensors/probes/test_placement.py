@@ -47,6 +47,13 @@ def test_fillers_keep_their_places_and_need_no_normal() -> None:
     assert probes.with_radius(0.02).radius.tolist() == [0, 0.02]
 
 
+def _rhombs() -> Probes:
+    """Return a grid whose rows and columns are even, but whose rows lean by 30°."""
+    row, column = np.divmod(np.arange(9), 3)
+    places = np.stack([column + 0.5 * row, np.sqrt(0.75) * row, 0.0 * row], axis=1)
+    return Probes(1e-3 * places, np.tile([0.0, 0, 1], (9, 1)), 1e-3, (3, 3), pitch=(1e-3, 1e-3))
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -59,6 +66,8 @@ def test_fillers_keep_their_places_and_need_no_normal() -> None:
         (lambda: Probes([[0, 0, 0]], [[0, 0, 1]], 0.1, pitch=(0.1, True)), "pitch .*received True"),
         (lambda: Probes([[0, 0, 0]] * 4, [[0, 0, 1]] * 4, [0.1, 0.1]), "one radius or 4"),
         (lambda: Probes([[0, 0, np.nan]], [[0, 0, 1]], 0.1), "finite"),
+        (lambda: Probes([[0, 0, 0], [9, 0, 0], [12, 0, 0]], [[0, 0, 1]] * 3, 4.0), "not mm"),
+        (_rhombs, "do not form"),
         (lambda: Probes.grid(2, 2, size=(1, 1), along=(0, 0, 1)), "parallel to the normal"),
         (lambda: Probes.grid(0, 2, size=(1, 1)), "rows .*at least 1; received 0"),
         (lambda: Probes.grid(2, 1.5, size=(1, 1)), r"columns .*received 1\.5"),  # type: ignore[arg-type]

@@ -84,6 +84,31 @@ def test_pressures_add_up_to_the_contact_forces_of_the_engine() -> None:
     assert (pressure >= 0).all()
 
 
+@pytest.mark.parametrize("dilation", ["separable", "fft", "direct"])
+def test_the_gel_of_a_mirrored_hand_moves_as_its_mirror_image(dilation: str) -> None:
+    """Its rows grow the other way about the normal; whatever the order of rows is, a marker moves alike."""
+    flip = np.array([-1.0, 1.0, 1.0])
+    rows = np.arange(20).reshape(4, 5)[::-1].ravel()
+    grid = Probes.grid(4, 5, size=(0.018, 0.02), center=(0, 0, 0.005), radius=0.003)
+    same = {"normal": grid.normal, "radius": grid.radius, "shape": grid.shape, "pitch": grid.pitch}
+    grids = [grid, Probes(grid.position * flip, **same), Probes(grid.position[rows], **same)]
+    readings = []
+    for markers, side in zip(grids, (1.0, -1.0, 1.0), strict=True):
+        scene = pad_scene(Geometry(name="ball", link="ball", kind="sphere", size=(RADIUS,)))
+        gel = ElastomerTaxel(link="hand", probes=markers, points=4000, dilation=dilation)  # type: ignore[arg-type]
+        suite = SensorSuite(scene, {"gel": gel}, num_envs=1)
+        for step in range(4):
+            place = (side * (0.002 + 0.0003 * step), 0.003 + 0.0002 * step, 0.005 + RADIUS - 0.001)
+            suite.update(state_of(scene, poses_at(3, {2: place})))
+        readings.append(suite.read("gel")[0].flatten(0, 1).numpy())
+    right, left, reversed_ = readings
+    largest = np.abs(right).max(axis=0)
+    assert (largest > 1e-3).all()
+    np.testing.assert_allclose(reversed_, right[rows], atol=1e-6)
+    # Points on the ball are not their own mirror image.
+    assert (np.abs(left * flip - right).max(axis=0) < 0.03 * largest).all()
+
+
 def test_what_has_no_pressure_is_refused() -> None:
     scene = pad_scene(Geometry(name="ball", link="ball", kind="sphere", size=(RADIUS,)))
     line = Probes(np.tile([0.0, 0, 0.005], (3, 1)), np.tile([0.0, 0, 1], (3, 1)), np.full(3, 1e-3))
