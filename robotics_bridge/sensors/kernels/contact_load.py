@@ -499,14 +499,15 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, mode: int, sticky: bool,
                 normal = faces.face[here].normal
                 body = faces.face[here].other
                 size = wp.length(faces.face[here].force)
-                lack = wp.vec2f(size, 0.0)
+                lack = wp.vec2f(wp.inf, 0.0)
                 watched = faces.watched[here]
                 for k in range(plan.sensors.shape[1]):
                     if ((watched >> k) & 1) == 0 or left:
                         continue
                     sensor = plan.sensors[link, k]
                     span = plan.spans[sensor]
-                    # What this sensor does not carry of the face: force and moment.
+                    # What this sensor does not carry of the face: force, and size of force and moment.
+                    miss = wp.vec3f()
                     rest = wp.vec2f()
                     fresh = ((written >> k) & 1) == 0
                     near = bool(False)
@@ -655,19 +656,19 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, mode: int, sticky: bool,
                                 total = total_of(total)
                             written = written | (1 << k)
                             fresh = False
-                            gap = wp.length(push.force - total)
                             # Rounding of the sums is no loss.
-                            if not (gap <= 1.0e-4 * wp.length(push.force)):
-                                rest[0] += gap
+                            if not (wp.length(push.force - total) <= 1.0e-4 * wp.length(push.force)):
+                                miss += push.force - total
                             node = wp.where(source == wp.static(NEAR), faces.follower[node], -1)
                         elif source == wp.static(NEAR):
-                            rest[0] += wp.length(push.force)
+                            miss += push.force
                             node = faces.follower[node]
                         elif wp.static(deep):
                             source += 1
                         else:
                             left = True
                             node = -1
+                    rest[0] = wp.length(miss)
                     # Sensors of a link need not all feel it: the best counts, whatever their order.
                     if not (rest[0] > lack[0] or (rest[0] == lack[0] and rest[1] >= lack[1])):
                         lack = rest

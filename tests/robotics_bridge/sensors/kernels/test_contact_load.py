@@ -12,7 +12,7 @@ from robotics_bridge import hands
 from robotics_bridge.envs.kernels.actuation import add_contact_forces
 from robotics_bridge.hands.observations import observe
 from robotics_bridge.hands.scenes import closing, holding
-from robotics_bridge.physics import MujocoEngine
+from robotics_bridge.physics import HandState, MujocoEngine, TouchScene
 from robotics_bridge.sensors import (
     ContactAudio,
     ContactProbe,
@@ -25,6 +25,7 @@ from robotics_bridge.sensors import (
 from robotics_bridge.sensors.audio.sensors import Modes
 from robotics_bridge.sensors.temperature.grid import ThermalBody
 from tests.factories.sensor_episode import require_processor
+from tests.factories.touch_scenes import PAD as PAD_OF_HAND
 
 mujoco = pytest.importorskip("mujoco")
 wp = warp()
@@ -451,6 +452,24 @@ def test_what_no_taxel_feels_is_missing_with_its_newtons_and_its_reason(caplog: 
     other = SensorSuite(engine.scene, {"t": KinematicTaxel(link="pad", probes=GRID)}, num_envs=1)
     other.update(engine.state)
     assert (_missing(suite), _missing(other)) == (pytest.approx(0.981, rel=0.01), 0.0)
+
+
+@pytest.mark.parametrize(("load", "lost"), [(0.5, 1.58), (3e38, np.nan)])
+def test_missing_is_what_the_sum_of_the_taxels_lacks_of_opposed_drags(load: float, lost: float) -> None:
+    """Two points of a flex drag against one another, of which taxels are near one; loads beyond all numbers are NaN."""
+    scene = TouchScene(("world", "hand"), (PAD_OF_HAND,), flexes=("cloth",), reports_forces=True)
+    corner = Probes.grid(3, 3, size=(0.004, 0.004), center=(0.01, 0, 0.005), radius=0.003)
+    suite = SensorSuite(scene, {"t": KinematicTaxel(link="hand", probes=corner)}, num_envs=1)
+    state = HandState.empty(1, 2, 2)
+    points, drags = [[0.01, 0, 0.005], [-0.01, 0, 0.005]], [[1.5, 0, 0], [-1.5, 0, 0]]
+    pushes = {"force": [load, load], "normal": [[0, 0, 1.0]] * 2, "position": points, "friction": drags}
+    state.set_contacts([0, 0], [(0, -1)] * 2, **pushes)
+    suite.update(state)
+    assert _missing(suite, "hand") == pytest.approx(lost, rel=0.01, nan_ok=True)
+    assert suite.unfelt.tolist() == [True]
+    if load == 0.5:
+        total = suite.read("t")[0].reshape(-1, 6).sum(0).numpy()
+        assert np.linalg.norm([0, 0, -1.0] - total[:3]) == pytest.approx(lost, rel=0.01)
 
 
 def test_two_patches_of_a_link_share_what_pushes_it_by_sides() -> None:
