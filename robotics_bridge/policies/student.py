@@ -18,7 +18,7 @@ import torch
 from torch import nn
 
 from brainbench.core.errors import UsageError, check_name
-from robotics_bridge.policies.encoders.arms import EncoderConfig, Stepped, TactileEncoder, elu_perceptron
+from robotics_bridge.policies.encoders.arms import EncoderConfig, FeatureNorm, Stepped, TactileEncoder, elu_perceptron
 
 _LEAST = 1e-2  # added to the deviations, as rsl_rl does
 
@@ -282,6 +282,11 @@ class TactilePolicy(MLPModel):
 
     def get_latent(self, obs: Any, masks: torch.Tensor | None = None, hidden_state: Any = None) -> torch.Tensor:
         """Return the latent: of a step (the model remembers), or of padded sequences [T, B, …] when masks are given."""
+        for norm in self._norms if self.training else ():
+            # As observations, features are counted once for each step that was taken, after it was learned from: the
+            # policy that learns is the one that acted, and padding counts for nothing.
+            norm.held = norm.held or []
+            norm.train(masks is None)
         if masks is None:
             if self._state is None:
                 self._state = self.zeros(len(obs[next(iter(self.shapes))]))[None]
@@ -324,6 +329,12 @@ class TactilePolicy(MLPModel):
             normaliser._std = deviation.copy_(normaliser._std)
         if self.core.tactile is not None and TACTILE in obs.keys():  # noqa: SIM118 - a TensorDict has no other "in"
             self.core.tactile.observe_scale(obs[TACTILE].reshape(-1, 1, *self.core.tactile.shape))
+        for norm in self._norms:
+            norm.settle()
+
+    @property
+    def _norms(self) -> list[FeatureNorm]:
+        return [part for part in self.core.modules() if isinstance(part, FeatureNorm)]
 
     def as_jit(self) -> nn.Module:
         """Raise UsageError: rsl_rl's own script would lose the encoder, and PyTorch ends TorchScript."""

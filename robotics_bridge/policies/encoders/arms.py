@@ -160,10 +160,10 @@ class EchoState(nn.Module):
 
 
 class FeatureNorm(nn.Module):
-    """Features [..., F] less their mean over their standard deviation, over all that was seen in training mode.
+    """Features [..., F] less their mean over their standard deviation, over all that was counted in training mode.
 
     Unlike layer norm it takes away what is the same in every step, and unlike batch norm it acts alike in training and
-    after it.
+    after it. Features are counted as they come, or with :attr:`held` at the next :meth:`settle`.
     """
 
     count: torch.Tensor
@@ -175,16 +175,28 @@ class FeatureNorm(nn.Module):
         self.register_buffer("count", torch.zeros(1, dtype=torch.float64))
         self.register_buffer("mean", torch.zeros(features, dtype=torch.float64))
         self.register_buffer("square", torch.ones(features, dtype=torch.float64))
+        self.held: list[torch.Tensor] | None = None
+        """Features that are yet to be counted; None counts each at once."""
+
+    def settle(self) -> None:
+        """Count what was held."""
+        while self.held:
+            self._count(self.held.pop(0))
+
+    @torch.no_grad()
+    def _count(self, x: torch.Tensor) -> None:
+        flat = x.reshape(-1, x.shape[-1]).double()
+        self.count += len(flat)
+        share = len(flat) / self.count
+        self.mean += share * (flat.mean(0) - self.mean)
+        self.square += share * (flat.square().mean(0) - self.square)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the standardised features [B, F]; in training mode they are counted first."""
-        if self.training:
-            with torch.no_grad():
-                flat = x.detach().reshape(-1, x.shape[-1]).double()
-                self.count += len(flat)
-                share = len(flat) / self.count
-                self.mean += share * (flat.mean(0) - self.mean)
-                self.square += share * (flat.square().mean(0) - self.square)
+        """Return the standardised features [B, F]; in training mode they are counted first, or held."""
+        if self.training and self.held is None:
+            self._count(x.detach())
+        elif self.training:
+            self.held.append(x.detach())
         spread = (self.square - self.mean.square()).clamp(min=0).sqrt()
         # Features of untrained networks are small by orders of magnitude, so what counts as constant is relative: to
         # the other features, and to the feature's own mean, of which single precision keeps seven digits.

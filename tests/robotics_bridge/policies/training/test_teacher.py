@@ -334,6 +334,60 @@ def test_forces_of_all_taxels_are_learned_from_or_the_run_says_that_it_diverged(
     assert not list(tmp_path.glob("*.safetensors"))
 
 
+def test_features_are_counted_once_a_step_after_it_was_learned_from() -> None:
+    """Padding of sequences counts for nothing, and the policy that learns gives actions the odds that they had."""
+    env = tasks.make("in_palm_rotate", num_envs=4, observe="agg_force", placement="tips", threads=1)
+    trainer = Trainer(env, seed=0, observe=("proprio", "touch"), encoder="reservoir")
+    actor, batches, gaps = trainer.algorithm.actor, [], []
+    make_batches, log_prob = trainer.algorithm.storage.recurrent_mini_batch_generator, actor.get_output_log_prob
+
+    def noted_batches(*sizes: int):
+        for batch in make_batches(*sizes):
+            batches.append(batch)
+            yield batch
+
+    def noted_odds(actions: torch.Tensor) -> torch.Tensor:
+        odds = log_prob(actions)
+        if batches:
+            gaps.append(float((odds.detach() - batches[-1].old_actions_log_prob.squeeze()).abs().max()))
+        return odds
+
+    trainer.algorithm.storage.recurrent_mini_batch_generator, actor.get_output_log_prob = noted_batches, noted_odds
+    for iteration in (1, 2):
+        trainer.iterate()
+        assert float(actor.core.tactile.norm.count) == iteration * trainer.config["num_steps_per_env"] * 4
+        assert gaps[0] < 1e-4
+        batches.clear()
+        gaps.clear()
+
+
+@pytest.mark.parametrize(("envs", "parts"), [(2, 1), (5, 1), (6, 3), (8, 4)])
+def test_a_policy_with_memory_learns_from_every_step_of_few_environments(envs: int, parts: int) -> None:
+    env = tasks.make("in_palm_rotate", num_envs=envs, observe="agg_bool", placement="tips", threads=1)
+    trainer = Trainer(env, seed=0, observe=("proprio", "touch"))
+    storage, sizes = trainer.algorithm.storage, []
+    make_batches = storage.recurrent_mini_batch_generator
+
+    def noted_batches(*counts: int):
+        for batch in make_batches(*counts):
+            sizes.append(batch.advantages.numel())
+            # Single environments lose their axis, and every step would meet every other.
+            assert batch.old_actions_log_prob.squeeze().shape == batch.actions.shape[:-1]
+            yield batch
+
+    storage.recurrent_mini_batch_generator = noted_batches
+    row = trainer.iterate()
+    epochs, steps = trainer.config["algorithm"]["num_learning_epochs"], trainer.config["num_steps_per_env"]
+    assert sizes == [envs * steps // parts] * (parts * epochs)
+    assert all(math.isfinite(value) for name, value in row.items() if name.startswith("loss/"))
+
+
+def test_a_single_environment_is_too_few_for_a_policy_with_memory() -> None:
+    env = tasks.make("in_palm_rotate", num_envs=1, observe="agg_bool", placement="tips", threads=1)
+    with pytest.raises(UsageError, match="at least two environments at a time; received 1"):
+        Trainer(env, seed=0, observe=("proprio", "touch"))
+
+
 def test_what_a_hand_has_not_is_refused_before_anything_is_trained(tmp_path: Path) -> None:
     refused = [("tuch", "did you mean 'touch'"), ("goal", "'goal', which only"), ("priv_proprio", "'priv_proprio'")]
     for name, culprit in refused:
