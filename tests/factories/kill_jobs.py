@@ -238,7 +238,7 @@ def _train(inputs: Path, out: Path) -> None:
     from tests.factories.training_sweeps import tiny
 
     options: dict[str, Any] = {"epochs": 3, "batch_size": 8, "optimizer": "adamw", "learning_rate": 1e-3}
-    options |= {"checkpoint_seconds": 0.0, "augmentation": "physical", "precision": "float32"}
+    options |= {"checkpoint_seconds": 1e-9, "augmentation": "physical", "precision": "float32"}
     train(TrainingConfig.published("zhuang-small", "supervised", **options), tiny(), out=out, device="cpu")
 
 

@@ -70,7 +70,7 @@ class TrainingConfig:
     seed: _Times = 0
     """Seed of weights, order, augmentation and dropout."""
     checkpoint_seconds: NotNegative = 60.0
-    """Time between saved states within an epoch; the end of every epoch saves too."""
+    """Time (s) between saved states within an epoch, 0 for none there; the end of every epoch saves too."""
     weights_dtype: Literal["auto", DType] = "auto"
     """Precision of the published weights: ``float32``, ``float16``, ``bfloat16``, or ``auto``: bfloat16 where the run
     trains in bf16 (half the size), else float32."""

@@ -202,7 +202,7 @@ class _Run:
                 if failure:
                     return self._result("diverged", failure)
                 self.progress(self.at.step, self._steps, f"training {self.config.model}")
-                late, reason = time.monotonic() - self.saved > self.config.checkpoint_seconds, stop.reason()
+                late, reason = 0 < self.config.checkpoint_seconds < time.monotonic() - self.saved, stop.reason()
                 over, due = self.where.any(bool(reason), late)
                 # After an epoch's last batch the end of the epoch saves; a state between the two would lose it.
                 if (over or due) and self.at.step % steps:

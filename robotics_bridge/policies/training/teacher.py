@@ -316,13 +316,11 @@ class Trainer:
         self.config = self.settings.config(groups, actor)
         # rsl_rl cuts the pass of a policy with memory by environments, leaves out what is left over, and multiplies all
         # steps by all where a part holds a single one.
-        pieces, what = (
-            env.num_envs * (1 if actor else self.settings.steps_per_env),
-            "environments" if actor else "steps",
-        )
+        pieces = env.num_envs * (1 if actor else self.settings.steps_per_env)
         fits = (n for n in range(min(self.settings.minibatches, pieces // 2), 0, -1) if not actor or pieces % n == 0)
         parts = self.config["algorithm"]["num_mini_batches"] = next(fits, 0)
         if not parts:
+            what = "environments" if actor else "steps"
             raise UsageError(f"PPO learns from at least two {what} at a time; received {pieces}: take more of them.")
         observations = self.env.get_observations()
         # rsl_rl prints its networks; what a command prints is its own business.

@@ -357,6 +357,14 @@ def test_weights_are_stored_as_they_were_trained(precision, stored, tmp_path):
     assert {value.dtype for value in model.parameters()} == {torch.float32}
 
 
+@pytest.mark.parametrize(("seconds", "saves"), [(0.0, 2), (1e-9, 6)])
+def test_no_seconds_between_saved_states_leave_those_of_epochs(seconds, saves, tmp_path, monkeypatch):
+    steps, save = [], trainer._Run._save
+    monkeypatch.setattr(trainer._Run, "_save", lambda run: steps.append(run.at.step) or save(run))
+    train(_config(epochs=2, batch_size=3, checkpoint_seconds=seconds), tiny(train=9), out=tmp_path, device="cpu")
+    assert len(steps) == saves
+
+
 SCRIPT = """
 import sys
 import torch
@@ -368,7 +376,7 @@ from tests.factories.training_sweeps import tiny
 torch.set_num_threads(1)
 config = TrainingConfig.published(
     "s4-small+gpt", "supervised", epochs=3, batch_size=8, optimizer="adamw", learning_rate=1e-3,
-    checkpoint_seconds=0.0, probe_epochs=2, augmentation="physical", precision="float32",
+    checkpoint_seconds=1e-9, probe_epochs=2, augmentation="physical", precision="float32",
 )
 if __name__ == "__main__":
     train(config, tiny(), out=sys.argv[1], device="cpu")
