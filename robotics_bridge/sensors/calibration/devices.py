@@ -377,9 +377,9 @@ class _Search:
         """Return that of all numbers [P, P]."""
         return np.linalg.inv(self.normal_equations(self.reply, self.device, robust=False)[0])
 
-    def straightened(self, suspects: NDArray[np.int64]) -> Device:
-        """Return the device with the order and sense of axes and the place of suspects that explain them best."""
-        device, nominal = self.device, self.presses.axes
+    def straightened(self, device: Device, suspects: NDArray[np.int64]) -> Device:
+        """Return a device with the order and sense of axes and the place of suspects that explain them best."""
+        nominal = self.presses.axes
         moves = np.array([*itertools.product(_MOVES, repeat=3)])
         turn = device.turn.as_matrix()
         turn[suspects] = np.eye(3)
@@ -410,16 +410,21 @@ class _Search:
 
     def search(self) -> None:
         """Fit everything, then from other places of the taxels that are explained badly."""
+        first = self.device
         self.settle()
         step, late = self.presses.log.step, self.device.shared["read_delay"]
         if (whole := step * round(late / step)) != late:
             self.attempt(replace(self.device, shared=self.device.shared | {"read_delay": whole}))
+        seen, rest = ((self.readings - values)[:, self.touched] for values in (self.device.bias, self.reply.readings))
+        if np.linalg.norm(rest) > TRUSTED["law"] * np.linalg.norm(seen):
+            # Where all are wrong alike, none is explained worse than the others, and the law is bent to fit them.
+            self.attempt(self.straightened(first, np.flatnonzero(self.touched)))
         for nudge in (0.0, *_NUDGES):
             if not len(suspects := self.suspects(_SUSPECT)):
                 break
             place = self.device.place.copy()
             place[suspects] += nudge * np.array(self.presses.probes.normal)[suspects]
-            self.attempt(replace(self.device, place=place) if nudge else self.straightened(suspects))
+            self.attempt(replace(self.device, place=place) if nudge else self.straightened(self.device, suspects))
 
     def suspects(self, sure: float) -> NDArray[np.int64]:
         """Return the taxels that are explained worse than the median one by ``sure`` standard errors, or worse in one
@@ -565,12 +570,15 @@ def _faults(device: Device, spread: NDArray, presses: Presses, touched: NDArray,
     # Standard errors beyond a tolerance, corrected for the number of comparisons.
     sure = float(norm.isf(ACCUSED / (3 * touched.sum() + 2)))
     faults = []
-    for n in np.flatnonzero((device.axes != presses.axes).any(axis=(1, 2))):
-        text = f"taxel {names[n]} falls where it is pressed"
+    wrong = np.flatnonzero((device.axes != presses.axes).any(axis=(1, 2)))
+    alike = 1 < touched.sum() == len(wrong) and bool((device.axes[wrong] == device.axes[wrong[0]]).all())
+    for n in wrong[:1] if alike else wrong:
+        who, ending = ("all taxels", "") if alike else (f"taxel {names[n]}", "s")
+        text = f"{who} fall{ending} where the ball presses"
         if device.axes.shape[1] == 3:
             words = ["-"[: int(row.sum() < 0)] + "xyz"[int(np.abs(row).argmax())] for row in device.axes[n]]
-            text = f"taxel {names[n]} gives {', '.join(words)} where x, y, z belong"
-        faults.append(Fault("axes", names[n], text))
+            text = f"{who} give{ending} {', '.join(words)} where x, y, z belong"
+        faults.append(Fault("axes", "" if alike else names[n], text))
     shift = device.place - presses.probes.position
     common = np.median(shift[touched], axis=0)
     if (far := float(np.linalg.norm(common))) > TOLERANCES["place"]:
