@@ -498,7 +498,6 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, mode: int, sticky: bool,
                 sphere = sphere_of(faces.face[here])
                 normal = faces.face[here].normal
                 body = faces.face[here].other
-                size = wp.length(faces.face[here].force)
                 lack = wp.vec2f(wp.inf, 0.0)
                 watched = faces.watched[here]
                 for k in range(plan.sensors.shape[1]):
@@ -672,7 +671,7 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, mode: int, sticky: bool,
                     # Sensors of a link need not all feel it: the best counts, whatever their order.
                     if not (rest[0] > lack[0] or (rest[0] == lack[0] and rest[1] >= lack[1])):
                         lack = rest
-                pushed += size
+                pushed += wp.length(faces.face[here].force)
                 lost += lack
                 here = wp.where(left, -1, faces.face[here].next)
             if wp.static(not deep):
