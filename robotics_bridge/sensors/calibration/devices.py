@@ -544,7 +544,8 @@ def _doubts(search: _Search, held: float, taxels: list[dict[str, Any]], idle: ND
     doubts: list[str] = []
     if not held <= TRUSTED["law"]:
         size = "no taxel was touched" if np.isnan(held) else f"the law errs by {held:.1%}"
-        doubts.append(f"On the presses that were held out {size} (at most {TRUSTED['law']:.0%}): log more presses.")
+        remedy = "log more presses, or check the clock, the frame of the ball and the order of taxels"
+        doubts.append(f"On the presses that were held out {size} (at most {TRUSTED['law']:.0%}): {remedy}.")
     if idle.any():
         untouched = listing(taxels[n]["taxel"] for n in np.flatnonzero(idle))
         doubts.append(f"Never touched, and left where they should be: {untouched}; press there.")
