@@ -55,6 +55,6 @@ def replay(
     text += f"{result.tracking:.2g} rad (rms)."
     if record.unit != "N":
         text += f" Forces of the log are in {record.unit!r}: only the correlations compare."
-    text += f"\nWrote {out}." if out is not None else ""
+    text += "".join(f"\n{doubt}" for doubt in result.doubts) + (f"\nWrote {out}." if out is not None else "")
     data = {"hand": model.name, "frames": len(record.time), "joints": record.joints, "taxels": rows}
-    return Output({**data, "tracking": result.tracking, "unit": record.unit, "out": out}, text)
+    return Output({**data, "tracking": result.tracking, "unit": record.unit, "doubts": result.doubts, "out": out}, text)

@@ -271,6 +271,7 @@ _RATE = 200.0  # least physics reports per second
 _STEPS = (1e-4, 1.0)  # shortest and longest median step of a log (s); beyond them time looks like ms, µs or frames
 _GAP = 60.0  # longest gap of a log (s), through which the simulated hand waits
 _MOST = 1_000_000  # most frames of an episode
+_ALIKE, _SCALE = 0.7, 30.0  # correlation over all taxels from which sign and scale of a log are compared; largest scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -341,6 +342,18 @@ class Replay:
     def tracking(self) -> float:
         """Root mean square of simulated less measured joints (rad, m)."""
         return float(np.sqrt(np.mean((self.position - self.log.position) ** 2)))
+
+    @property
+    def doubts(self) -> list[str]:
+        """What speaks for another sign or unit of the log, where both hands feel the same course."""
+        real, simulated = (values - values.mean(axis=0) for values in (self.log.force, self.simulated))
+        product, power = float((real * simulated).sum()), float((simulated**2).sum())
+        alike = product / max(np.sqrt(power * float((real**2).sum())), 1e-300)
+        if alike < -_ALIKE:
+            return ["The log falls where the simulated hand feels more: forces along inward normals are positive."]
+        if self.log.unit == "N" and alike > _ALIKE and not 1 / _SCALE < (scale := product / power) < _SCALE:
+            return [f"The log reads {scale:.3g} times what the simulated hand feels: is it in another unit than N?"]
+        return []
 
     def rows(self) -> list[dict[str, Any]]:
         """Return link, number, peaks, error and correlation of every taxel."""

@@ -228,6 +228,19 @@ def test_what_the_simulated_hand_recorded_is_replayed_to_the_last_newton(recorde
     assert felt["correlation"] == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize(
+    ("factor", "words"), [(1.0, ""), (3.0, ""), (1e3, "reads 1e+03 times"), (1e-3, "another unit"), (-1.0, "log falls")]
+)
+def test_a_log_of_another_sign_or_unit_is_doubted(recorded, factor, words) -> None:
+    log = replace(recorded.log, force=factor * recorded.log.force + 0.2)
+    doubts = Replay(log, recorded.simulated, recorded.position).doubts
+    assert len(doubts) == bool(words)
+    assert words in "".join(doubts)
+    # Touch of something else tells neither.
+    other = replace(log, force=np.random.default_rng(0).normal(size=log.force.shape))
+    assert not Replay(other, recorded.simulated, recorded.position).doubts
+
+
 @pytest.mark.parametrize("missing", [(), (5, 6, 7)])
 def test_an_action_moves_the_hand_after_the_state_of_its_frame(recorded, jaws, tmp_path, missing) -> None:
     """A hand that is driven here, reported before each command as LeRobot does, goes the same way in the replay."""
