@@ -106,7 +106,7 @@ def bend_between(beam: BeamCompliance, place: real, near: vec3, there: vec3) -> 
     )
 
 
-@wp.func
+@wp.func(inline=True)
 def bend_of_contacts(
     chains: ChainArrays,
     problems: ContactProblems,

@@ -23,7 +23,7 @@ least_slope = 2e-7 if real is wp.float32 else 1e-14
 tiny = 1e-12 if real is wp.float32 else 1e-24
 
 
-@wp.func
+@wp.func(inline=True)
 def primitive(kind: int, size: vec3, x: vec3) -> vec4:
     """Return the outward direction at a point and its signed distance from a primitive."""
     zero = real(0.0)
