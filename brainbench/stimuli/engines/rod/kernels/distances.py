@@ -78,16 +78,48 @@ def primitive(kind: int, size: vec3, x: vec3) -> vec4:
 
 
 @wp.func
-def segment_primitive(kind: int, size: vec3, link: Cone) -> vec5:
+def slope_change(link: Cone) -> real:
+    """Return by how much the slope of the gap to a convex shape may pass zero between an end of a link and any place.
+
+    Along a segment not at all; beside it, by how far the tangents turn from the chords of the line. Places on the cubic
+    are bounded by those that it goes through; some more is left for rounding.
+    """
+    change = real(0.01) * wp.length(link.b - link.a)
+    if wp.static(smooth):
+        offset = wp.transpose(link.line.offset)
+        turn = wp.transpose(link.line.turn)
+        chord = offset[3] - offset[0]
+        near = offset[1] - offset[0] - chord / real(3.0)
+        far = offset[2] - offset[3] + chord / real(3.0)
+        turned = wp.max(wp.length(turn[0] - chord), wp.length(turn[1] - chord))
+        turned = wp.max(turned, wp.max(wp.length(turn[2] - chord), wp.length(turn[3] - chord)))
+        bowed = wp.max(wp.length(near + near - far), wp.length(far + far - near))
+        change = change + real(9.0) * bowed + real(2.7) * turned
+    return change
+
+
+@wp.func
+def segment_primitive(kind: int, size: vec3, link: Cone, start: vec4, end: vec4) -> vec5:
     """Return the place along a link (0 to 1) of the least gap, that gap (negative inside) and the normal.
 
-    The gap is convex along a segment, and hardly less along its centre line: its slope is halved to zero.
+    The gap is convex along a segment, and hardly less along its centre line: its slope is halved to zero, unless what
+    :func:`primitive` says of ``start`` and ``end`` proves that one of them is nearest.
     """
     low = real(0.0)
     high = real(1.0)
     ra = link.start_radius
     rb = link.end_radius
-    for _ in range(wp.static(halvings)):
+    tries = int(wp.static(halvings))
+    # Directions close to a surface would change by rounding.
+    if wp.min(start[3], end[3]) > real(1e-4) * wp.max(wp.length(link.a), wp.length(link.b)):
+        change = slope_change(link)
+        if wp.dot(vec3(start[0], start[1], start[2]), line_tangent(link, low)) - (rb - ra) > change:
+            high = low
+            tries = 0
+        elif wp.dot(vec3(end[0], end[1], end[2]), line_tangent(link, high)) - (rb - ra) < -change:
+            low = high
+            tries = 0
+    for _ in range(tries):
         middle = real(0.5) * (low + high)
         here = primitive(kind, size, line_place(link, middle))
         along = line_tangent(link, middle)

@@ -296,18 +296,18 @@ def link_shape_distance(
             b = a
     # Primitives: what lies between the ends, and the far end on its own.
     if meshed == 0:
-        beside = segment_primitive(shapes.kind[s], shapes.size[s] / scale, link)
-        # The gap counts from the skin, the bound from the axis; the thinner end keeps it a lower bound.
-        found.clearance = beside[1] + wp.min(ra, rb)
-        touch_between(found, beside)
         if wp.static(smooth):
             a = line_place(link, real(0.0))
             b = line_place(link, real(1.0))
         tip = primitive(shapes.kind[s], shapes.size[s] / scale, b)
+        near = primitive(shapes.kind[s], shapes.size[s] / scale, a)
+        beside = segment_primitive(shapes.kind[s], shapes.size[s] / scale, link, near, tip)
+        # The gap counts from the skin, the bound from the axis; the thinner end keeps it a lower bound.
+        found.clearance = beside[1] + wp.min(ra, rb)
+        touch_between(found, beside)
         found.end = 1
         found.end_gap = tip[3] - rb
         found.end_normal = vec3(tip[0], tip[1], tip[2])
-        near = primitive(shapes.kind[s], shapes.size[s] / scale, a)
         found.start = 1
         found.start_gap = near[3] - ra
         found.start_normal = vec3(near[0], near[1], near[2])
