@@ -123,7 +123,7 @@ const auto any = [&](const real* bound, real most) INLINE {
     return found;
 };
 real square[children], share[children], v[children], w[children];
-if (any(side, lower(bounds.side, got.side))) {
+if (line.length > zero && any(side, lower(bounds.side, got.side))) {
     SIDE_BY_SIDE for (int k = 0; k < children; k++) {
         real p[3], q[3], r[3];
         triangle(k, p, q, r);
@@ -148,7 +148,7 @@ const auto measure =
         }
 };
 measure(b, end, bounds.end, got.end, got.end_face, got.end_v, got.end_w);
-measure(a, start, bounds.start, got.start, got.start_face, got.start_v, got.start_w);
+if (line.length > zero) measure(a, start, bounds.start, got.start, got.start_face, got.start_v, got.start_w);
 """
 )
 def measure_triangles(
