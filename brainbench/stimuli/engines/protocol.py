@@ -202,8 +202,13 @@ class WhiskerEngine:
         """Return how many groups are simulated at a time, given the ``workers`` of a run."""
         return workers or usable_processors()
 
-    def simulate_group(self, jobs: Sequence[Job], fidelity: Fidelity, *, record_shape: bool) -> list[Trace]:
-        """Simulate the jobs of one group, each as often as it takes to be trusted; for :meth:`run`."""
+    def simulate_group(
+        self, jobs: Sequence[Job], fidelity: Fidelity, *, record_shape: bool, motions: dict[Any, Any]
+    ) -> list[Trace]:
+        """Simulate the jobs of one group, each as often as it takes to be trusted; for :meth:`run`.
+
+        In ``motions`` an engine keeps what it made of their motions for the next simulation of the same jobs.
+        """
         raise NotImplementedError(f"The engine {self.name!r} has a run of its own.")
 
     def check(self, jobs: Sequence[Job], fidelity: Fidelity, workers: int | None = None) -> None:
@@ -258,12 +263,11 @@ class WhiskerEngine:
             workers: native threads; all usable processors when None. On a GPU they mean nothing.
             record_shape: fill :attr:`Trace.link_positions`.
         """
-        simulate, once = (
-            partial(engine.simulate_group, record_shape=record_shape) for engine in (self, replace(self, retry=1))
-        )
 
         def run(group: Sequence[int]) -> dict[int, Trace]:
-            some = [jobs[index] for index in group]
+            some, engines = [jobs[index] for index in group], (self, replace(self, retry=1))
+            options: dict[str, Any] = {"record_shape": record_shape, "motions": {}}
+            simulate, once = (partial(engine.simulate_group, **options) for engine in engines)
             traces = with_errors(simulate, some, fidelity, once) if self.errors else simulate(some, fidelity)
             return dict(zip(group, traces, strict=True))
 

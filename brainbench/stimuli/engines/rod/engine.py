@@ -86,35 +86,37 @@ class JobTask:
         return self.twists, self.job.air_flow is not None, whisker.follicle is not None, bool(whisker.bends), smooth
 
 
-def make_task(
-    job: Job, fidelity: Fidelity, bodies: dict[Any, tuple[NDArray, Track]], *, silent: bool = False
-) -> JobTask | None:
+def make_task(job: Job, fidelity: Fidelity, bodies: dict[Any, Any], *, silent: bool = False) -> JobTask | None:
     """Return what a job needs of its scene, None when it feels nothing, unless ``silent`` jobs are wanted too.
 
-    ``bodies`` keeps anchor and track of obstacles that move by their id and the steps in which they are looked at, of
-    what stands still by its place.
+    ``bodies`` keeps tracks of bases, and anchor and track of obstacles that move, by their ids and how they are looked
+    at, and those of what stands still by its place.
     """
     start, stop = job.start, float(job.times[-1])
     chain = fidelity.chain(job.whisker)
     step = fidelity.step_of(chain)
-    cutting = Cutting(start, stop, step, fidelity.time_step)
-    base = follicle_track(job.follicle, job.whisker.arc_length, cutting)
+    # Finer simulations of a whisker look at its motions in the same steps and cells.
+    cells = max(1, math.ceil(fidelity.time_step / KNOT - 1e-9))
+    cutting = Cutting(start, stop, min(step, KNOT / LOOKS), KNOT * cells)
+    mount = id(job.follicle), job.whisker.arc_length, cutting
+    if mount not in bodies:
+        bodies[mount] = follicle_track(job.follicle, job.whisker.arc_length, cutting)
+    base = bodies[mount]
 
     # All that stands still is one body, near the base of the whisker and of its neighbours.
     place = tuple((np.round(base.knots["place"][0] / GRID) * GRID / MILLI).tolist())
     if place not in bodies:
         bodies[place] = np.array(place), still_track(np.array(place))
     moving = [obstacle for obstacle in job.obstacles if obstacle.motion is not None]
-    looks = min(step, KNOT / LOOKS)
     for obstacle in moving:
-        if (id(obstacle), looks) not in bodies:
+        if (id(obstacle), cutting) not in bodies:
             anchor = obstacle.bounds.mean(axis=0)
-            bodies[id(obstacle), looks] = anchor, body_track(obstacle, anchor, cutting)
+            bodies[id(obstacle), cutting] = anchor, body_track(obstacle, anchor, cutting)
     # What moves is looked at wherever its motion, or that of the base, has a knot.
     ends = np.array([start, stop])
     seen = np.unique(
         np.concatenate(
-            [track.times for track in (base, *(bodies[id(obstacle), looks][1] for obstacle in moving))] + [ends]
+            [track.times for track in (base, *(bodies[id(obstacle), cutting][1] for obstacle in moving))] + [ends]
         )
     )
     position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(seen))
@@ -122,7 +124,7 @@ def make_task(
     if not silent and is_silent(job, reach, position, euler):
         return None
     near = tuple(
-        TrackedObstacle(obstacle, *bodies[place if obstacle.motion is None else (id(job.obstacles[which]), looks)])
+        TrackedObstacle(obstacle, *bodies[place if obstacle.motion is None else (id(job.obstacles[which]), cutting)])
         for which, obstacle in zip(reach.indices, reach.obstacles, strict=True)
     )
     names = tuple(
@@ -300,15 +302,16 @@ class RodEngine(WhiskerEngine):
             parts += [some[first : first + size] for first in range(0, len(some), size)]
         return parts
 
-    def simulate_group(self, jobs: Sequence[Job], fidelity: Fidelity, *, record_shape: bool) -> list[Trace]:
+    def simulate_group(
+        self, jobs: Sequence[Job], fidelity: Fidelity, *, record_shape: bool, motions: dict[Any, Any]
+    ) -> list[Trace]:
         """See :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.simulate_group`: a launch for each kind."""
         traces: dict[int, Trace] = {}
         tasks: dict[Any, dict[int, JobTask]] = {}
-        bodies: dict[Any, tuple[NDArray, Track]] = {}
         seconds = np.zeros(len(jobs))
         for index, job in enumerate(jobs):
             started = time.thread_time()
-            task = make_task(job, fidelity, bodies)
+            task = make_task(job, fidelity, motions)
             seconds[index] = time.thread_time() - started
             if task is None:
                 traces[index] = silent_trace(job, fidelity, record_shape, seconds[index])

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from brainbench.stimuli.engines.error_estimates import halved_step, more_links
 from brainbench.stimuli.engines.rod.engine import PackedTasks, make_task
 from brainbench.stimuli.engines.rod.launch import Approach, followed
 from brainbench.stimuli.objects.obstacle import Capsule
@@ -20,6 +21,14 @@ def test_jobs_beside_the_same_object_share_its_shapes_unless_they_are_to_have_th
     assert apart.jobs.scene.tolist() == [0, 1]
     assert len(shared.chains) == len(apart.chains) == 1
     assert shared.shapes.arrays()["quaternion"].shape == (1, 4)
+
+
+def test_finer_simulations_of_a_whisker_take_the_motion_of_its_base_that_was_looked_at_before():
+    job, motions = touching_job(POST), {}
+    finer = more_links(halved_step(COARSE, job.whisker, job.spacing), job.whisker)
+    tasks = [make_task(job, fidelity, motions) for fidelity in (COARSE, finer)]
+    assert tasks[0].base is tasks[1].base
+    assert tasks[0].chain.links < tasks[1].chain.links
 
 
 def test_a_blow_is_followed_up_to_a_part_of_the_radius_and_others_as_far_as_contacts_are_sought():
