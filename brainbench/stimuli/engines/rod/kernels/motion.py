@@ -189,7 +189,7 @@ def raw_turn(motions: MotionArrays, piece: TrackPiece) -> vec4:
     )
 
 
-@wp.func
+@wp.func(inline=True)
 def pose_at(motions: MotionArrays, index: int, when: Instant) -> BodyMotion:
     """Return the motion of a track at a time."""
     first = motions.first[index]
