@@ -159,6 +159,9 @@ class WhiskerEngine:
     """Whether :meth:`run` estimates the error of every whisker (:mod:`.error_estimates`), as stimulus sets have it; two
     further simulations of those in contact."""
 
+    motions: dict[Any, Any] = field(default_factory=dict, repr=False, compare=False)
+    """What it made of the motions of some jobs, which it may simulate several times."""
+
     name: ClassVar[str]
     """Name under which :func:`brainbench.stimuli.engines.get_engine` finds it."""
     package: ClassVar[str] = ""
@@ -202,13 +205,8 @@ class WhiskerEngine:
         """Return how many groups are simulated at a time, given the ``workers`` of a run."""
         return workers or usable_processors()
 
-    def simulate_group(
-        self, jobs: Sequence[Job], fidelity: Fidelity, *, record_shape: bool, motions: dict[Any, Any]
-    ) -> list[Trace]:
-        """Simulate the jobs of one group, each as often as it takes to be trusted; for :meth:`run`.
-
-        In ``motions`` an engine keeps what it made of their motions for the next simulation of the same jobs.
-        """
+    def simulate_group(self, jobs: Sequence[Job], fidelity: Fidelity, *, record_shape: bool) -> list[Trace]:
+        """Simulate the jobs of one group, each as often as it takes to be trusted; for :meth:`run`."""
         raise NotImplementedError(f"The engine {self.name!r} has a run of its own.")
 
     def check(self, jobs: Sequence[Job], fidelity: Fidelity, workers: int | None = None) -> None:
@@ -265,9 +263,10 @@ class WhiskerEngine:
         """
 
         def run(group: Sequence[int]) -> dict[int, Trace]:
-            some, engines = [jobs[index] for index in group], (self, replace(self, retry=1))
-            options: dict[str, Any] = {"record_shape": record_shape, "motions": {}}
-            simulate, once = (partial(engine.simulate_group, **options) for engine in engines)
+            some, engine = [jobs[index] for index in group], replace(self, motions={})
+            simulate, once = (
+                partial(each.simulate_group, record_shape=record_shape) for each in (engine, replace(engine, retry=1))
+            )
             traces = with_errors(simulate, some, fidelity, once) if self.errors else simulate(some, fidelity)
             return dict(zip(group, traces, strict=True))
 

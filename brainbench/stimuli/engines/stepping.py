@@ -7,7 +7,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -303,9 +302,7 @@ class SteppedEngine(WhiskerEngine, ABC):
     def simulate(self, stepped: SteppedJob) -> Trace:
         """Simulate one job that is not silent; return what :meth:`SteppedJob.trace` does."""
 
-    def simulate_group(
-        self, jobs: Sequence[Job], fidelity: Fidelity, *, record_shape: bool, motions: dict[Any, Any]
-    ) -> list[Trace]:
+    def simulate_group(self, jobs: Sequence[Job], fidelity: Fidelity, *, record_shape: bool) -> list[Trace]:
         """Simulate jobs one after the other, but for those that are silent."""
         traces = []
         for stepped in (SteppedJob(job, fidelity, record_shape) for job in jobs):

@@ -302,16 +302,14 @@ class RodEngine(WhiskerEngine):
             parts += [some[first : first + size] for first in range(0, len(some), size)]
         return parts
 
-    def simulate_group(
-        self, jobs: Sequence[Job], fidelity: Fidelity, *, record_shape: bool, motions: dict[Any, Any]
-    ) -> list[Trace]:
+    def simulate_group(self, jobs: Sequence[Job], fidelity: Fidelity, *, record_shape: bool) -> list[Trace]:
         """See :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.simulate_group`: a launch for each kind."""
         traces: dict[int, Trace] = {}
         tasks: dict[Any, dict[int, JobTask]] = {}
         seconds = np.zeros(len(jobs))
         for index, job in enumerate(jobs):
             started = time.thread_time()
-            task = make_task(job, fidelity, motions)
+            task = make_task(job, fidelity, self.motions)
             seconds[index] = time.thread_time() - started
             if task is None:
                 traces[index] = silent_trace(job, fidelity, record_shape, seconds[index])

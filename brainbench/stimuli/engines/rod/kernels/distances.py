@@ -32,8 +32,6 @@ def primitive(kind: int, size: vec3, x: vec3) -> vec4:
         z = x[2]
         if kind == wp.static(CAPSULE):
             z = x[2] - wp.clamp(x[2], -size[1], size[1])
-        else:
-            z = x[2]
         away = vec3(x[0], x[1], z)
         far = wp.length(away)
         if far > real(tiny):
@@ -109,17 +107,14 @@ def segment_primitive(kind: int, size: vec3, link: Cone, start: vec4, end: vec4)
     high = real(1.0)
     ra = link.start_radius
     rb = link.end_radius
-    tries = int(wp.static(halvings))
     # Directions close to a surface would change by rounding.
     if wp.min(start[3], end[3]) > real(1e-4) * wp.max(wp.length(link.a), wp.length(link.b)):
         change = slope_change(link)
         if wp.dot(vec3(start[0], start[1], start[2]), line_tangent(link, low)) - (rb - ra) > change:
             high = low
-            tries = 0
         elif wp.dot(vec3(end[0], end[1], end[2]), line_tangent(link, high)) - (rb - ra) < -change:
             low = high
-            tries = 0
-    for _ in range(tries):
+    for _ in range(wp.static(halvings) * int(high > low)):
         middle = real(0.5) * (low + high)
         here = primitive(kind, size, line_place(link, middle))
         along = line_tangent(link, middle)
