@@ -56,7 +56,7 @@ class Ledger:
         self.totals[kind] += number
         self.read[kind] += read
 
-    def leave(self, kind: str, reason: str, number: int = 1, *, lost: bool = False, rows: tuple[int, ...] = ()) -> None:
+    def leave(self, kind: str, reason: str, number: int = 1, *, lost: bool = False, rows: Sequence[int] = ()) -> None:
         """Note that so many were not read, and why. Raises DataError for a lost one if the ledger is strict."""
         if lost and self.strict:
             raise DataError(reason)

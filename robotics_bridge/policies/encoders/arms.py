@@ -193,10 +193,9 @@ class FeatureNorm(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return the standardised features [B, F]; in training mode they are counted first, or held."""
-        if self.training and self.held is None:
-            self._count(x.detach())
-        elif self.training:
-            self.held.append(x.detach())
+        if self.training:
+            count = self._count if self.held is None else self.held.append
+            count(x.detach())
         spread = (self.square - self.mean.square()).clamp(min=0).sqrt()
         # Features of untrained networks are small by orders of magnitude, so what counts as constant is relative: to
         # the other features, and to the feature's own mean, of which single precision keeps seven digits.
