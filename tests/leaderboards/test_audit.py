@@ -34,7 +34,7 @@ def test_an_older_estimator_is_stale_and_an_older_package_alone_is_not(make_reco
     assert remarks([_stored(_with(make_record(), version="0.0.9"), tmp_path)]) == {}
     record = _with(make_record(), settings={"estimator_version": 0})
     ((doubt,),) = remarks([_stored(record, tmp_path)]).values()
-    assert doubt.startswith("stale: version 0 of the default estimator, now 4")
+    assert doubt.startswith("stale: version 0 of the default estimator, now 5")
 
 
 @pytest.mark.parametrize(
