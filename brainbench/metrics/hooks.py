@@ -145,8 +145,8 @@ class MetricHooks:
 
     def partner(self, animal: SubjectRDM, others: Sequence[SubjectRDM]) -> Any:
         """Return the layer that an animal is compared with: the others' units side by side, whatever their scale."""
-        centred = [other.patterns - other.patterns.mean(axis=0) for other in others]
-        return np.concatenate([patterns / (np.linalg.norm(patterns) or 1.0) for patterns in centred], axis=1)
+        sizes = [np.linalg.norm(other.patterns - other.patterns.mean(axis=0)) or 1.0 for other in others]
+        return np.concatenate([other.patterns / size for other, size in zip(others, sizes, strict=True)], axis=1)
 
     def agreement(self, animal: SubjectRDM, others: Sequence[SubjectRDM], estimator: str) -> Corrected:
         """Return the factor that corrects the comparison of an animal with others."""
