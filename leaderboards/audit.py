@@ -223,6 +223,7 @@ class _Placed:
     record: ResultRecord
 
     def change(self, kind: Kind, before: str, after: str, causes: tuple[str, ...] = ()) -> Change:
+        """Return a change of this model, from one state in print to another."""
         return Change(kind, self.board, self.name, before, after, causes)
 
 

@@ -405,6 +405,7 @@ def _ranks(models: Sequence[Sequence[Entry]]) -> list[tuple[int | None, int | No
     groups = min(map(dependent, models), key=len)
 
     def row(place: int) -> tuple[Any, Any, Any]:
+        """Return means over benchmarks of the differences, their standard errors and degrees of freedom."""
         parts = [test(place) for test in tests]
         return np.mean([part[0] for part in parts], axis=0), *_combined([part[1:] for part in parts], groups)
 

@@ -158,6 +158,7 @@ def differences(samples: Sequence[Sample]) -> Row:
     whole = whole and np.isfinite([*map(np.sum, centred)]).all()
 
     def row_of(place: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return the differences of one model to those after it, their standard errors and degrees of freedom."""
         after = slice(place + 1, None)
         if whole:  # without an array of the differences, which took most of the time of a large board
             animals, stimuli = (cdist(values[[place]], values[after], "sqeuclidean")[0] for values in centred)

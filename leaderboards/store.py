@@ -116,10 +116,12 @@ def lightened(record: ResultRecord, shared: dict[object, Any]) -> ResultRecord:
     """
 
     def packed(numbers: Sequence[float]) -> array[float]:
+        """Return numbers as a compact array of doubles, the same one for equal numbers."""
         values = array("d", numbers)
         return shared.setdefault(values.tobytes(), values)
 
     def light(score: Score, **rdms: Sequence[float]) -> Score:
+        """Return a score without its RDMs but for those given."""
         small = replace(
             score, model_rdm=(), brain_rdm=(), stimuli=shared.setdefault(score.stimuli, score.stimuli),
             **({} if score is record.score else {"layers": (), "provenance": {}}),

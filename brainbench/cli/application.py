@@ -147,4 +147,5 @@ class _Lines(logging.Formatter):
     """Lines of the log, in which texts of others are data."""
 
     def format(self, record: logging.LogRecord) -> str:
+        """Return the line of a record, with control characters as escapes."""
         return visible_lines(super().format(record))

@@ -231,6 +231,7 @@ def with_options(
         parameters.append(field.parameter(variable, words, default))
 
     def make(values: dict[str, Any]) -> Any:
+        """Return the dataclass, or the mapping, of the values of its flags."""
         options = {fields_of[flag]: stated[fields_of[flag]].value(flag, value) for flag, value in values.items()}
         # Defaults that are tuples are not read from the source; the dataclass has them.
         options = {n: value for n, value in options.items() if not (stated[n].several and value is None)}
@@ -258,6 +259,7 @@ def filled_from(
     every = [item.replace(kind=inspect.Parameter.KEYWORD_ONLY) for item in every]
 
     def run(**values: Any) -> Output:
+        """Run the command with its one parameter made of the values of the options."""
         filled = make({item.name: values.pop(item.name) for item in options})
         return command(**{parameter: filled}, **values)
 
@@ -483,6 +485,7 @@ def needs(*packages: Requirement, cache: bool = False) -> Callable[[Callable[...
     """Decorate a command, outermost, with what it needs."""
 
     def mark(command: Callable[..., Output]) -> Callable[..., Output]:
+        """Note at a command what it needs."""
         command.needs = Needs(packages, cache)  # type: ignore[attr-defined]
         return command
 
@@ -527,6 +530,7 @@ def _linked(callback: Callable[..., Output]) -> Callable[..., Output]:
 
     @functools.wraps(callback)
     def run(*, allow_linked: Any = None, **values: Any) -> Output:
+        """Run the command after noting the folders that files may link into."""
         if allow_linked:
             os.environ[LINKED_VARIABLE] = os.pathsep.join(map(str, allow_linked))
         return callback(**values)
@@ -556,6 +560,7 @@ def _checked(name: str, callback: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(callback)
     def run(*args: Any, **values: Any) -> Any:
+        """Run the command if what it needs is there."""
         check_requirements(needed, values)
         return callback(*args, **values)
 

@@ -40,6 +40,7 @@ def printed(command: Callable[..., Output]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def run(*, as_json: bool = False, **values: Any) -> None:
+        """Run the command, print what it returns as text or JSON, and raise its failure."""
         data, text, out, failure = command(**values)
         if out is not None:
             write_json(out, data)
@@ -70,6 +71,7 @@ def list_without_command(app: typer.Typer, command: Callable[[], Output]) -> Non
 
     @app.callback(invoke_without_command=True)
     def run(context: typer.Context) -> None:
+        """Print the listing where no command is named."""
         if context.invoked_subcommand is None:
             print(visible_lines(command().text, styled=sys.stdout.isatty()))
 
@@ -158,6 +160,7 @@ def progress_bar(what: str = "") -> Iterator[Progress]:
         tasks: dict[str, Any] = {what: bar.add_task(what, total=None)} if what else {}
 
         def update(done: int, total: int, what: str) -> None:
+            """Set a bar to the steps done, of all; one that is new is added."""
             if what not in tasks:
                 tasks[what] = bar.add_task(what, total=total)
             bar.update(tasks[what], completed=done, total=total)

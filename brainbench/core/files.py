@@ -467,6 +467,7 @@ class _Disk(io.FileIO):
     held: tuple[tuple[int, bytes], ...] = ()
 
     def write(self, data: Any) -> int:
+        """Write bytes [n] and return n, also where the disk takes no more."""
         rest, place = memoryview(data).cast("B"), self.tell()
         size = len(rest)
         try:
@@ -480,6 +481,7 @@ class _Disk(io.FileIO):
         return size
 
     def readinto(self, buffer: Any) -> int:
+        """Read bytes into a buffer and return how many; what is held goes before what is on disk."""
         view, place = memoryview(buffer).cast("B"), self.tell()
         count = super().readinto(view)
         for start, content in self.held:
@@ -489,6 +491,7 @@ class _Disk(io.FileIO):
         return count
 
     def truncate(self, size: int | None = None) -> int:
+        """Set the file's length [bytes] and return it, also where the disk takes no more."""
         try:
             return super().truncate(size)
         except OSError as error:

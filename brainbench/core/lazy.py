@@ -33,6 +33,7 @@ def lazy_exports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[
         return {name: where for name, where in modules.items() if name in module.__all__}
 
     def load(name: str) -> Any:
+        """Import a name of the package, or one of its modules, and keep it there."""
         if where := exports().get(name):
             value = getattr(import_module(where), name)
         elif not name.startswith("_") and find_spec(f"{package}.{name}"):

@@ -98,6 +98,7 @@ def limited(
     """
 
     def decorate(cls: type) -> type:
+        """Give a class the checks of its fields' limits, ahead of its own."""
         if "__dataclass_fields__" in vars(cls):
             raise TypeError(f"@limited stands below @dataclass on {cls.__qualname__}, or it would check nothing.")
         relations = vars(cls).get("__post_init__", getattr(cls, "__post_init__", None))
@@ -220,6 +221,7 @@ def _number(whole: bool, limit: msgspec.Meta) -> Check:
     ]
 
     def check(name: str, value: Any) -> None:
+        """Raise :class:`UsageError` unless a value is a number within the bounds, or infinite where that is allowed."""
         if not (endless and isinstance(value, float) and value in endless):
             check_number(f"{name} ({about['unit']})" if about["unit"] else name, value, whole=whole, **bounds)
 
@@ -238,6 +240,7 @@ def _union(kinds: Sequence[Any]) -> Check | None:
     allows_none = NoneType in kinds
 
     def check(name: str, value: Any) -> None:
+        """Raise :class:`UsageError` unless one of the kinds allows a value."""
         faults = []
         for kind, limit in checks if value is not None or not allows_none else ():
             if limit is None and isinstance(kind, type) and not isinstance(value, kind):
@@ -262,6 +265,7 @@ def _values(fixed: bool, kinds: Sequence[Any], limit: msgspec.Meta) -> Check | N
     noun = "values" if None in checks else "numbers"
 
     def check(name: str, value: Any) -> None:
+        """Raise :class:`UsageError` unless a value is a row whose length and values are allowed."""
         no_row = str | bytes | Mapping | set | frozenset | Iterator
         several = isinstance(value, Iterable) and not isinstance(value, no_row) and getattr(value, "ndim", 1) > 0
         values: list[Any] = list(value) if several else []

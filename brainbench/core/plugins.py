@@ -41,6 +41,7 @@ class _AsWritten(SourceFileLoader):
     """Compiles a file as it stands: bytecode is kept by time in seconds and length, which an edit may leave alone."""
 
     def get_code(self, fullname: str) -> CodeType:
+        """Return the compiled file, never its bytecode on disk."""
         path = self.get_filename(fullname)
         return self.source_to_code(self.get_data(path), path)
 
@@ -249,6 +250,7 @@ def _importable(folder: Path) -> Iterator[None]:
     before = set(sys.modules)
 
     def own_finder(path: str) -> Any:
+        """Return the finder of modules in the folder; ``ImportError`` leaves other paths to Python."""
         # What is installed in an environment below the folder keeps its bytecode.
         if "site-packages" in path or not Path(path).is_relative_to(folder):
             raise ImportError

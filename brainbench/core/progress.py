@@ -29,6 +29,7 @@ def stages(total: int, what: str, progress: Progress | None) -> Callable[[], Non
     done = count()
 
     def stage_done() -> None:
+        """Report one more stage as done."""
         if progress is not None:
             progress(next(done), total, what)
 

@@ -44,10 +44,12 @@ class UniquePart:
         """Return what a mapping states; numbers that are none are NaN: a record is data that anyone may write."""
 
         def number(value: Any) -> float:
+            """Return a finite number as it is; NaN for all else."""
             real = isinstance(value, (int, float)) and not isinstance(value, bool)
             return float(value) if real and abs(value) <= sys.float_info.max else math.nan
 
         def texts(value: Any) -> tuple[str, ...]:
+            """Return the texts of a list; nothing for all else."""
             return tuple(map(_text, value)) if isinstance(value, (list, tuple)) else ()
 
         span = stated.get("interval")

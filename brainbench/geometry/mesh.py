@@ -414,6 +414,7 @@ class _Beside:
         self.folder = folder
 
     def get(self, name: str) -> bytes:
+        """Return the bytes of a file that the mesh names."""
         if Path(name).suffix.lower() not in (".bin", ".glbin", ".mtl", ".ply", ".stl"):
             raise DataError(f"{brief(name)} holds no part of a mesh's shape.")
         return part_of(self.folder, name, "part of a mesh").read_bytes()
@@ -421,6 +422,7 @@ class _Beside:
     __getitem__ = get
 
     def keys(self) -> tuple[str, ...]:
+        """Return no names: trimesh asks for each by its own."""
         return ()
 
 

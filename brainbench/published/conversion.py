@@ -544,6 +544,7 @@ def convert_sweeps(tree: SweepTree, out: str | os.PathLike[str], *, progress: Pr
             raise DataError(f"The object {name!r} has the labels {sorted(several)}; an object has one label.")
 
     def run(missing: Sequence[PlannedShard], folder: Path, done: Callable[[int], None]) -> None:
+        """Write the shards that are missing, one in memory at a time."""
         for shard in missing:
             done(write_shard(tree.content(shard), folder))
 

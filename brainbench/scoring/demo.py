@@ -48,6 +48,7 @@ def demo_recordings(name: str = "demo", *, progress: Progress | None = None) -> 
     origin = {"stimuli_hash": stimuli.content_hash, "weights": weights, "config_hash": content_hash(name, *made_of)}
 
     def make(folder: Path) -> None:
+        """Write the recordings into a new folder."""
         from brainbench.datasets.synthetic import ResponseGeometry, write_files
         from brainbench.datasets.synthetic.populations import squared_euclidean_rdm
 

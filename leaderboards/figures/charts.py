@@ -66,6 +66,7 @@ def _accuracy_of(entries: Sequence[Entry]) -> tuple[str, Callable[[Entry], float
     name = "top5" if stated and all(card.top5 is not None for card in stated) else "top1"
 
     def read(entry: Entry) -> float | None:
+        """Return an entry's accuracy, mean over its seeds; None where no card states it."""
         cards = [record.card for record in entry.records if record.card is not None]
         values = [value for card in cards if (value := getattr(card, name)) is not None]
         return math.fsum(values) / len(values) if values else None

@@ -280,6 +280,7 @@ def beside(record: ResultRecord) -> svg.Drawing:
     scaled = math.isfinite(record.score.scaled)
 
     def rows(score: Score) -> tuple[Callable[[float], float], Interval | None]:
+        """Return what places a value of a score on the axis, and its interval there."""
         return (score.on_scale, score.scaled_interval) if scaled else (float, score.interval)
 
     animals = record.animal_to_animal

@@ -191,6 +191,7 @@ def _pdf(text: str, path: Path) -> bytes:
         raise missing_dependency("weasyprint", extra="board", purpose=f"Writing PDF (or {instead})") from error
 
     def refuse(url: str, *_: object, **__: object) -> dict[str, object]:
+        """Refuse to load anything for the page."""
         raise ValueError(f"A report loads nothing from elsewhere; asked for {url}.")
 
     try:

@@ -398,6 +398,7 @@ def rebuilt(root: Path) -> Iterator[Callable[[str, _Content], Path]]:
         with ExitStack() as stack:
 
             def stage(name: str, content: _Content) -> Path:
+                """Write a file of the new site beside its place, and return that place."""
                 temporary = stack.enter_context(atomic_path(root / name, sync=False))
                 if isinstance(content, (str, bytes)):
                     data = content.encode() if isinstance(content, str) else content

@@ -91,6 +91,7 @@ class _Worker:
 
     @classmethod
     def running(cls) -> subprocess.Popen[str]:
+        """Return the process, started where this process has none that runs."""
         # A forked process must not share the pipe of its parent.
         if cls.process is None or cls._owner != os.getpid() or cls.process.poll() is not None:
             paths = os.pathsep.join(filter(None, sys.path))
@@ -111,6 +112,7 @@ class _Worker:
 
     @staticmethod
     def end(process: subprocess.Popen[str]) -> None:
+        """End a process and close its pipes."""
         process.kill()
         for stream in (process.stdin, process.stdout):
             with contextlib.suppress(OSError):

@@ -69,10 +69,12 @@ def _check(file: Any) -> bool:
     linked: list[str] = []
 
     def visit_link(name: bytes, link: Any) -> None:
+        """Note a link that leads to another file."""
         if link.type not in (h5l.TYPE_HARD, h5l.TYPE_SOFT):
             linked.append(os.fsdecode(name))
 
     def visit(name: str, node: Any) -> None:
+        """Check a group or an array, and note one whose values lie in other files."""
         _attributes(node, name)
         if getattr(node, "shape", None) is not None:
             _array(node, name)

@@ -27,6 +27,7 @@ def parse_json(text: str, name: str) -> Any:
     """Parse JSON text; ``name`` is that of its file in messages."""
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        """Return the pairs of one object as a mapping; a name that stands twice is a :class:`DataError`."""
         if len(values := dict(pairs)) < len(pairs):
             raise DataError(f"{brief(name)} has {listing(repeats(key for key, _ in pairs))} twice in one object.")
         return values

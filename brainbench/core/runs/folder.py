@@ -259,6 +259,7 @@ def occupied(folder: Path, stop: Stop, *, lock: bool = True) -> Iterator[None]:
     """
 
     def terminate(number: int, frame: object) -> None:
+        """Note that the run was asked to stop."""
         stop.terminated = True
 
     # Python delivers signals to the main thread alone, and lets no other one ask for them.

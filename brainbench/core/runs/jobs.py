@@ -88,6 +88,7 @@ def run_on_cluster(
         running: dict[str, int] = {}
 
         def submit() -> None:
+            """Hand the next job to the scheduler, if one is left."""
             place = next(waiting, None)
             if place is not None:
                 future = client.submit(function, jobs[place], key=None if names is None else names[place])

@@ -600,6 +600,7 @@ def write_files(
     design = design or PopulationDesign()
 
     def draw() -> Iterator[tuple[Session, NDArray[np.float64]]]:
+        """Yield each session with its expected rates [K, U] (spikes/s), one in memory at a time."""
         for done, drawn in enumerate(draw_sessions(geometry, design, seed), start=1):
             yield replace(spike_session(geometry, drawn), stimuli=stimuli), drawn.expected
             if progress is not None:

@@ -285,6 +285,7 @@ def make_rodgers_demo(
         first_contacts(contacts, published.LABELS, plan.lost_whisker)
 
     def draw() -> Iterator[tuple[Session, NDArray[np.float64]]]:
+        """Yield each session with its expected rates [K, U] (spikes/s), one in memory at a time."""
         done, total = 0, sum(map(len, plans))
         for index, animal_plans in enumerate(plans):
             for number, plan in enumerate(animal_plans):

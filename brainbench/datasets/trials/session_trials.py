@@ -336,6 +336,7 @@ def _overlaps(part: SessionCounts) -> tuple[int, int]:
     """Count the trials whose window begins before that of an earlier trial ends, and before one of their label does."""
 
     def count(edges: NDArray[np.float64]) -> int:
+        """Count the windows of edges [R, 2] (s) that begin before an earlier one ends."""
         begin, end = edges[np.argsort(edges[:, 0])].T
         return int((begin[1:] < np.maximum.accumulate(end)[:-1] - 1e-9).sum())
 
@@ -488,6 +489,7 @@ def _joined(first: SessionCounts, second: SessionCounts, same: dict[int, int]) -
     rows_in_table = np.array([*first.rows, *(row_of[int(second.rows[row])] for row in more)], dtype=np.int64)
 
     def both(name: str) -> tuple[Any, ...]:
+        """Return a field's values of the first session, then those that only the second has."""
         return (*getattr(first, name), *(getattr(second, name)[row] for row in more))
 
     ids = both("trial_ids")

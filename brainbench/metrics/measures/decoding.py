@@ -152,6 +152,7 @@ def fit_softmax(features: Floats, target: Ints, classes: int, penalty: float) ->
     wanted = np.eye(classes, dtype=bool)[target]
 
     def loss(flat: Floats) -> tuple[float, Floats]:
+        """Return the loss and its gradient [(D + 1) C] at weights and biases in one row."""
         both = flat.reshape(width + 1, classes)
         weight, bias = both[:-1], both[-1]
         log_p = log_softmax(features @ weight + bias, axis=1)
@@ -301,6 +302,7 @@ class _BoundDecoding(LabelDecoding):
         self._classes = properties
 
     def layer(self, features: ArrayLike) -> Any:
+        """Return features [K, F] with the classes of their stimuli."""
         return LabelledFeatures(usable_features(features), self._classes)
 
     def among(self, stimuli: Ints) -> LabelDecoding:

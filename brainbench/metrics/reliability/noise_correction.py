@@ -134,6 +134,7 @@ def _by_split(average: Callable[[Floats], Any], least: float, lacking: str) -> _
     """Return a published estimator: the average ratio of splits whose raw correlation is at least ``least``."""
 
     def corrected(r_xy: Floats, halves: Floats, others: Floats | None, sides: list[float]) -> tuple[float, int, str]:
+        """Return the average ratio, the splits that entered, and why there is none."""
         ratio = corrected_splits(np.where(halves >= least, r_xy, np.nan), halves, others)
         # Imaginary ratios vanish, as published.
         real = ratio[np.isfinite(ratio)]

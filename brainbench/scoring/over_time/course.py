@@ -222,6 +222,7 @@ def layer_latencies(
     animals, step = excess.shape[-1], lags[1] - lags[0]
 
     def latency(values: Floats) -> Floats:
+        """Return the lag [s] of the best match along the axis of lags."""
         return lags[0] + step * best_lag(values)
 
     best = latency(excess)

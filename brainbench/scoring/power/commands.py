@@ -73,9 +73,11 @@ def power(
         rows.append((experiments.power(design, simulations=max(simulations, 1000), seed=seed), enough))
 
     def enough_text(row: Any, vary: str) -> str:
+        """Return in print the fewest stimuli or animals that reach the wanted power."""
         return str(row[1][vary] or "none tried") if row[0].design.effect > 0 else ""
 
     def span(row: Any) -> str:
+        """Return the interval of a power in print, or why there is none."""
         interval = row[0].interval
         return f"[{interval.low:.2f}, {interval.high:.2f}]" if interval else row[0].reason
 

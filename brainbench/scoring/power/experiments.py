@@ -251,6 +251,7 @@ def simulate_experiments(generator: np.random.Generator, design: ExperimentDesig
     """Return models [S, L, P] and measured animals [S, A, P]."""
 
     def rdms(*shape: int) -> Floats:
+        """Draw RDMs [..., P] of random patterns, scaled to mean 0 and variance 1."""
         patterns = generator.standard_normal((*shape, design.stimuli, design.dimensions))
         products = patterns @ patterns.swapaxes(-1, -2)
         squares = np.einsum("...kk->...k", products)

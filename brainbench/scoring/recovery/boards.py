@@ -579,6 +579,7 @@ def find_cheapest(
     failed: list[tuple[int, ...]] = []
 
     def measured(animals: int, units: int, trials: int, stimuli: int, **counted: int) -> TriedDesign:
+        """Return what boards of a design recover."""
         population = replace(design.population, animals=animals, units=units, trials=trials)
         changed = replace(design, population=population, stimuli=stimuli)
         result = recover(candidates, changed, **counted, **where)

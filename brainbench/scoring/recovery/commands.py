@@ -233,6 +233,7 @@ def _text(recovery: Recovery, want: float | None, cheapest: dict[str, Any] | Non
     lines += recovery.notes
 
     def mistaken(place: int) -> str:
+        """Return the network that came first most often in a true one's place, and how often."""
         firsts = zip(recovery.firsts[place], recovery.names, strict=True)
         count, rival = max((int(count), name) for count, name in firsts if name != recovery.names[place])
         return f"{rival} ({count})" if count else ""
