@@ -11,6 +11,7 @@ import errno
 import io
 import os
 import sys
+import threading
 from typing import Any
 
 INTERRUPTED = 130  # exit status after Ctrl-C, as shells count it: 128 and the number of the signal
@@ -91,8 +92,6 @@ def _run() -> None:
 
 def _leave() -> None:
     """Say so, and end at once if a compiler runs in a thread: it cannot be stopped, and Python would wait for it."""
-    import threading
-
     from brainbench.core.progress import PREPARATION
 
     print(f"\nbrainbench: {GO_ON}", file=sys.stderr)

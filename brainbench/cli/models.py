@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from brainbench.cli.options import SeedOption, out_file_option
 from brainbench.cli.output import Output, facts, list_without_command, progress_bar, table, table_of, tracked
 from brainbench.core.files import to_plain
-
-if TYPE_CHECKING:
-    from brainbench.models.recipes import PublishedTraining
-    from brainbench.models.registry import ModelDescription
+from brainbench.models.recipes import Architecture, PublishedTraining, find_recipe, list_recipes
+from brainbench.models.registry import (
+    FAMILY,
+    ModelDescription,
+    add_user_model,
+    describe_model,
+    list_models,
+    locate_model,
+    remove_user_model,
+    settings_file,
+)
+from brainbench.models.training.checkpoints import PREFIXES, find_folder, shipped
 
 UNTRAINED = "untrained: random weights, drawn from --seed (0 unless you say otherwise)"
 
@@ -25,8 +34,6 @@ def model_card(name: str, model: ModelDescription, recipe: PublishedTraining | N
     ``recipe`` says how it was trained in the published study, where its weights are not here; ``twin`` is a sentence
     about the untrained twin of trained weights.
     """
-    from brainbench.models.registry import FAMILY
-
     rows: dict[str, object] = {}
     if model.trained is not None:
         rows |= dict(_trained(model.trained))
@@ -79,9 +86,6 @@ def _accuracy(evaluation: Mapping[str, Any]) -> str:
 
 
 def _tagged(name: str) -> Iterator[str]:
-    from brainbench.models.recipes import Architecture
-    from brainbench.models.training.checkpoints import shipped
-
     return (tagged for tagged in shipped() if Architecture.parse(tagged).untrained == name)
 
 
@@ -91,12 +95,6 @@ app = typer.Typer(help="List and describe the registered models; add your own.")
 @app.command("list")
 def list_(pattern: Annotated[str, typer.Argument(help="Shell pattern, e.g. '*-ln*'.")] = "*") -> Output:
     """List the models by name, with their sizes and what their weights are (also: brainbench models)."""
-    from fnmatch import fnmatchcase
-
-    from brainbench.models.recipes import Architecture, list_recipes
-    from brainbench.models.registry import FAMILY, describe_model, list_models
-    from brainbench.models.training.checkpoints import shipped
-
     here = shipped()
     names = [*list_models(pattern), *(name for name in here if fnmatchcase(name, pattern))]
     records = [describe_model(name) for name in tracked(names, "measuring models")]
@@ -134,9 +132,6 @@ list_without_command(app, list_)
 @app.command("recipes")
 def recipes(pattern: Annotated[str, typer.Argument(help="Shell pattern, e.g. '*.simclr'.")] = "*") -> Output:
     """List the published combinations of architecture and objective, with their training settings."""
-    from brainbench.models.recipes import find_recipe, list_recipes
-    from brainbench.models.registry import describe_model
-
     chosen = [find_recipe(name) for name in list_recipes(pattern)]
     sizes = {name: describe_model(name) for name in {item.architecture for item in chosen}}
     columns = {
@@ -156,9 +151,6 @@ def show(
     name: Annotated[str, typer.Argument(help="A registry name, a recipe's name or a folder of trained weights.")],
 ) -> Output:
     """Describe one model: size, layers, citation and, with an objective, how it is trained."""
-    from brainbench.models.recipes import find_recipe, list_recipes
-    from brainbench.models.registry import describe_model
-
     recipe = find_recipe(name) if name in list_recipes() else None
     record = describe_model(recipe.model if recipe else name)
     data = {**to_plain(record), "trained_as": [*_tagged(record.name)]}
@@ -179,8 +171,6 @@ def add(
     name: Annotated[str, typer.Option(help="What to call it on the command line.")],
 ) -> Output:
     """Give a model of your own a name; it is kept in your settings, and the code stays where it is."""
-    from brainbench.models.registry import add_user_model, list_models, settings_file
-
     model = add_user_model(target, name, names=list_models())
     rows = {"model": model.name, "code": model.target, "kept in": settings_file()}
     return Output(model, f"{facts(rows)}\n\nscore it: brainbench score {model.name}")
@@ -191,8 +181,6 @@ def remove(
     name: Annotated[str, typer.Argument(help="A name that brainbench models add was given.")],
 ) -> Output:
     """Take the name of a model of your own away; its code stays."""
-    from brainbench.models.registry import remove_user_model
-
     model = remove_user_model(name)
     return Output(model, f"{model.name} is no longer a name of {model.target}; the code was not touched.")
 
@@ -204,9 +192,6 @@ def export(
     seed: SeedOption = 0,
 ) -> Output:
     """Export one step, obs and h_in to features and h_out, with its contract, and check the written file."""
-    from brainbench.models.registry import locate_model
-    from brainbench.models.training.checkpoints import PREFIXES, find_folder
-
     located = locate_model(model)  # before PyTorch is imported
     from brainbench.models.export import SUFFIXES, export_model
 

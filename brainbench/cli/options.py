@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import ast
 import builtins
-import functools
 import inspect
 import math
 import os
@@ -28,7 +27,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import typer
 
-from brainbench.cli.output import Output, printed
+from brainbench.cli.output import Output, show
 from brainbench.core import limits
 from brainbench.core.errors import UsageError, brief, check_name, missing_dependency
 from brainbench.core.figures import check_format
@@ -42,6 +41,17 @@ WorkersOption = Annotated[
 SeedOption = Annotated[int, typer.Option(help="Seed of untrained weights.")]
 PlanOption = Annotated[Path | None, typer.Option(help="Seal the design in this JSON file, for 'score --plan'.")]
 SchedulerOption = Annotated[str | None, typer.Option(help="Let workers of a Dask scheduler (tcp://host:8786) do it.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout, nothing else.")]
+LinkedOption = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--allow-linked",
+        metavar="FOLDER",
+        help="HDF5 files may link into this folder too, beside their own; give it again for more.",
+        exists=True,
+        file_okay=False,
+    ),
+]
 
 SCORE = "brainbench.scoring.options:ScoreOptions"
 SCORE_FLAGS = {
@@ -256,16 +266,21 @@ def filled_from(
     """
     parameters = inspect.signature(command, locals=unloaded, eval_str=True).parameters.values()
     every = [item for one in parameters for item in (options if one.name == parameter else [one])]
-    every = [item.replace(kind=inspect.Parameter.KEYWORD_ONLY) for item in every]
 
     def run(**values: Any) -> Output:
         """Run the command with its one parameter made of the values of the options."""
         filled = make({item.name: values.pop(item.name) for item in options})
         return command(**{parameter: filled}, **values)
 
+    return _as_command(run, command, every)
+
+
+def _as_command(run: Callable[..., Any], command: Callable[..., Any], every: Iterable[inspect.Parameter]) -> Any:
+    """Return a function with the parameters that typer reads, under the name and the docstring of a command."""
+    parameters = [item.replace(kind=inspect.Parameter.KEYWORD_ONLY) for item in every]
     run.__doc__, run.__name__ = command.__doc__, command.__name__
-    run.__signature__ = inspect.Signature(every)  # pyright: ignore[reportFunctionMemberAccess]
-    run.__annotations__ = {item.name: item.annotation for item in every}
+    run.__signature__ = inspect.Signature(parameters)  # pyright: ignore[reportFunctionMemberAccess]
+    run.__annotations__ = {item.name: item.annotation for item in parameters}
     return run
 
 
@@ -517,33 +532,29 @@ def check_requirements(needs: Needs, values: Mapping[str, Any]) -> None:
 
 
 def guard(app: typer.Typer) -> None:
-    """Let every command check what it needs before it runs; once, however often its command line is built."""
+    """Let every command check what it needs, and print what it returns; once, however often its line is built."""
     for name, command in commands(app):
         if command.callback is not None and not hasattr(command, "guarded"):
             command.guarded = True
-            checked = _checked(name, command.callback)
-            command.callback = printed(_linked(checked) if name in FOREIGN else checked)
+            command.callback = _guarded(name, command.callback)
 
 
-def _linked(callback: Callable[..., Output]) -> Callable[..., Output]:
-    """Return a command with the option ``--allow-linked``."""
+def _guarded(name: str, command: Callable[..., Output]) -> Callable[..., None]:
+    """Return a command with the options ``--json`` and, where it reads files of others, ``--allow-linked``."""
+    needed = needs_of(name, command)
+    added = [("allow_linked", LinkedOption, None)] * (name in FOREIGN) + [("as_json", JsonOption, False)]
 
-    @functools.wraps(callback)
-    def run(*, allow_linked: Any = None, **values: Any) -> Output:
-        """Run the command after noting the folders that files may link into."""
+    def run(*, as_json: bool, allow_linked: Sequence[Path] | None = None, **values: Any) -> None:
+        """Run the command if what it needs is there, and print what it returns."""
+        check_requirements(needed, values)
         if allow_linked:
             os.environ[LINKED_VARIABLE] = os.pathsep.join(map(str, allow_linked))
-        return callback(**values)
+        show(command(**values), as_json=as_json)
 
-    help = "HDF5 files may link into this folder too, beside their own; give it again for more."
-    option = typer.Option("--allow-linked", metavar="FOLDER", help=help, exists=True, file_okay=False)
-    added = inspect.Parameter(
-        "allow_linked", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[list[Path] | None, option]
-    )
-    signature = inspect.signature(callback, eval_str=True)
-    parameters = [*(item.replace(kind=added.kind) for item in signature.parameters.values()), added]
-    setattr(run, "__signature__", signature.replace(parameters=parameters))  # noqa: B010 - unknown to type checkers
-    return run
+    parameters = inspect.signature(command, eval_str=True).parameters.values()
+    kind = inspect.Parameter.KEYWORD_ONLY
+    more = (inspect.Parameter(key, kind, default=default, annotation=hint) for key, hint, default in added)
+    return _as_command(run, command, (*parameters, *more))
 
 
 def commands(app: typer.Typer, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -553,15 +564,3 @@ def commands(app: typer.Typer, path: str = "") -> Iterator[tuple[str, Any]]:
     for group in app.registered_groups:
         if group.typer_instance is not None:
             yield from commands(group.typer_instance, f"{path}{group.name} ")
-
-
-def _checked(name: str, callback: Callable[..., Any]) -> Callable[..., Any]:
-    needed = needs_of(name, callback)
-
-    @functools.wraps(callback)
-    def run(*args: Any, **values: Any) -> Any:
-        """Run the command if what it needs is there."""
-        check_requirements(needed, values)
-        return callback(*args, **values)
-
-    return run

@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import contextlib
-import functools
-import inspect
 import json
 import sys
 import threading
 import time as clock
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from io import StringIO
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import typer
 
 from brainbench.core.errors import visible, visible_lines
 from brainbench.core.files import to_json, write_json
 from brainbench.core.progress import Item, Progress, track
-
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout, nothing else.")]
 
 
 class Output(NamedTuple):
@@ -35,25 +32,14 @@ class Output(NamedTuple):
     """Raised after all is printed: the exit status, or an error."""
 
 
-def printed(command: Callable[..., Output]) -> Callable[..., None]:
-    """Return a command that prints its output, with the option ``--json`` behind its own."""
-
-    @functools.wraps(command)
-    def run(*, as_json: bool = False, **values: Any) -> None:
-        """Run the command, print what it returns as text or JSON, and raise its failure."""
-        data, text, out, failure = command(**values)
-        if out is not None:
-            write_json(out, data)
-        print(_encodable_json(data) if as_json else visible_lines(text, styled=sys.stdout.isatty()))
-        if failure is not None:
-            raise failure
-
-    parameters = inspect.signature(command, eval_str=True).parameters.values()
-    option = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=JsonOption)
-    every = [*(item.replace(kind=inspect.Parameter.KEYWORD_ONLY) for item in parameters), option]
-    run.__signature__ = inspect.Signature(every)  # pyright: ignore[reportAttributeAccessIssue]
-    run.__annotations__ = {item.name: item.annotation for item in every}
-    return run
+def show(output: Output, *, as_json: bool = False) -> None:
+    """Print what a command returns, as text or as JSON, and raise its failure."""
+    data, text, out, failure = output
+    if out is not None:
+        write_json(out, data)
+    print(_encodable_json(data) if as_json else visible_lines(text, styled=sys.stdout.isatty()))
+    if failure is not None:
+        raise failure
 
 
 def _encodable_json(data: Any) -> str:
@@ -73,7 +59,7 @@ def list_without_command(app: typer.Typer, command: Callable[[], Output]) -> Non
     def run(context: typer.Context) -> None:
         """Print the listing where no command is named."""
         if context.invoked_subcommand is None:
-            print(visible_lines(command().text, styled=sys.stdout.isatty()))
+            show(command())
 
 
 def table_of(title: str, items: Iterable[Any], columns: Mapping[str, str | Callable[[Any], object]]) -> str:
@@ -99,8 +85,6 @@ def table(title: str, columns: list[str], rows: list[list[str]], *, right: tuple
 
     The first column is never folded; where no terminal sets the width, those flush right are not either.
     """
-    from io import StringIO
-
     from rich.console import Console
     from rich.table import Table
 

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
+from numpy.typing import NDArray
 
 from brainbench.cli.options import (
     SCORE,
@@ -20,13 +24,12 @@ from brainbench.cli.options import (
 )
 from brainbench.cli.output import Output, facts, progress_bar, table, table_of
 from brainbench.cli.score import left_out
+from brainbench.core.contracts import join_labels
+from brainbench.core.errors import DataError, UsageError, listing
+from brainbench.scoring.demo import DEMOS, demo_recordings
+from brainbench.scoring.options import ScoreOptions
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    import numpy as np
-    from numpy.typing import NDArray
-
     from brainbench.datasets import StoredRDMs
     from brainbench.metrics.measures.rsa import RSA
     from brainbench.metrics.reliability.subject_rdm import SubjectRDM
@@ -67,15 +70,9 @@ def rdm(
     out: Annotated[Path | None, out_file_option("File to write too, as rsatoolbox reads it (.h5).")] = None,
 ) -> Output:
     """Compute every animal's RDM and its split-half reliability; or show the RDMs in a file of rsatoolbox."""
-    from dataclasses import replace
-
-    import numpy as np
-
-    from brainbench.core.errors import UsageError
     from brainbench.datasets.rdm_files import HoldsRDMsError, StoredRDMs, write_rdms
     from brainbench.datasets.trials.session_trials import pooled
     from brainbench.scoring.neural_responses import open_neural_responses
-    from brainbench.scoring.options import ScoreOptions
 
     measure = _of_rdms(metric)
     if out is not None and out.suffix.lower() not in (".h5", ".hdf5"):
@@ -133,13 +130,8 @@ def compare(
 
     A file of RDMs has no trials, so nothing is corrected for noise and nothing is tested: that is a score's part.
     """
-    import numpy as np
-
-    from brainbench.core.contracts import join_labels
-    from brainbench.core.errors import DataError, UsageError, listing
     from brainbench.metrics.rdms.comparison import compare as compare_rdms
     from brainbench.scoring.model_responses import resolve_model
-    from brainbench.scoring.options import ScoreOptions
 
     measure, stored = _of_rdms(metric), _stored(rdms)
     if stored is None:
@@ -176,7 +168,6 @@ def compare(
 
 
 def _of_rdms(metric: str) -> RSA:
-    from brainbench.core.errors import UsageError
     from brainbench.metrics import get_metric
     from brainbench.metrics.measures.rsa import RSA
 
@@ -263,8 +254,6 @@ def fetch(
 
 def _found(source: str) -> str:
     """Return a source as the files' readers take it: the demo recordings by their folder."""
-    from brainbench.scoring.demo import DEMOS, demo_recordings
-
     if source not in DEMOS:
         return source
     with progress_bar() as progress:

@@ -15,8 +15,14 @@ import typer
 from brainbench.cli.options import SCORE, SCORE_FLAGS, out_folder_option, report_file, typed_options, with_options
 from brainbench.cli.output import Output, progress_bar, table, table_of
 from brainbench.core.errors import UsageError
+from brainbench.core.files import to_plain
 from brainbench.core.identity import plan_note
+from brainbench.core.plugins import require_optional
 from brainbench.core.records import ResultRecord, Score, spanned
+from brainbench.core.statistics import compare_scores
+from leaderboards.ranking import CHANCE_LEVEL, lacking
+from leaderboards.store import write_record
+from leaderboards.text import group_rows, unique_sentence
 
 if TYPE_CHECKING:
     from brainbench.scoring.options import ScoreOptions
@@ -44,8 +50,6 @@ def score_text(record: ResultRecord) -> str:
 def _headline(record: ResultRecord) -> Iterator[str]:
     """Yield what was scored, its unique part, whether it is told apart from raw input, the score, and its limits."""
     from brainbench.models.activations import ReadReport
-    from leaderboards.ranking import CHANCE_LEVEL
-    from leaderboards.text import unique_sentence
 
     score, animals = record.score, record.animal_to_animal
     subjects = score.subjects or (animals.subjects if animals else ())
@@ -83,9 +87,6 @@ def _weights(record: ResultRecord) -> str:
 
 def _against_raw_input(record: ResultRecord) -> str:
     """Say whether a score is told apart from that of the raw input, by the test that boards use."""
-    from brainbench.core.statistics import compare_scores
-    from leaderboards.ranking import lacking
-
     score, raw = record.score, record.baselines.get(RAW_INPUT)
     if raw is None:
         return "Not compared with raw input: these features came without the input that they were computed from."
@@ -164,8 +165,6 @@ def walk_text(steps: list[dict[str, Any]]) -> str:
 
 def _details(statistics: Mapping[str, Any]) -> list[str]:
     """Lay out what single metrics and options add: accuracies by property, shares of variance, times."""
-    from leaderboards.text import group_rows
-
     parts = []
     if course := statistics.get("time_course"):
         parts.append(_over_time(course))
@@ -272,14 +271,10 @@ def score(
     ] = None,
 ) -> Output:
     """Score a model against neural recordings and write a result record and an HTML report."""
-    from brainbench.core.files import to_plain
-    from brainbench.core.statistics import compare_scores
     from brainbench.scoring.kept_records import keep, read_kept, record_path
     from leaderboards.site.build import write_report
-    from leaderboards.store import write_record
 
     if options.explain and Path(model).suffix == ".npz":
-        from brainbench.core.plugins import require_optional
         from brainbench.scoring.scores import PARTS
 
         if options != replace(type(options)(), explain=True) or report is not None:

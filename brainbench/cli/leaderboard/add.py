@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from collections import defaultdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -14,11 +14,12 @@ from brainbench.cli.output import Output, progress_bar
 from brainbench.core.errors import DataFileNotFoundError, UsageError, look_alike, visible
 from brainbench.core.files import to_json
 from brainbench.core.identity import ScoreIdentity
+from brainbench.core.records import ResultRecord
+from brainbench.core.runs.jobs import run_jobs
+from brainbench.scoring.demo import DEMOS
+from brainbench.scoring.jobs import ScoringJob, asked_settings, jobs_of, missing, parse_seeds, read_batch
+from leaderboards.audit import conflicting, names_of, remarks
 from leaderboards.store import StoredRecord, read_records, record_files, write_record
-
-if TYPE_CHECKING:
-    from brainbench.core.records import ResultRecord
-    from brainbench.scoring.jobs import ScoringJob
 
 
 def given_files(sources: list[Path]) -> list[Path]:
@@ -37,7 +38,6 @@ def take_in(paths: list[Path], to: Path, *, keep_both: bool) -> list[dict[str, A
     No name may read like another one that is there, or like a network of the registry.
     """
     from brainbench.models import list_models
-    from leaderboards.audit import names_of
 
     present: dict[ScoreIdentity, dict[str, ResultRecord]] = defaultdict(dict)
     names = {("name", look_alike(name)): name for name in list_models()}
@@ -62,8 +62,6 @@ def take_in(paths: list[Path], to: Path, *, keep_both: bool) -> list[dict[str, A
 def _take_in_one(
     stored: StoredRecord, to: Path, present: dict[ScoreIdentity, dict[str, ResultRecord]], *, keep_both: bool
 ) -> dict[str, Any]:
-    from leaderboards.audit import conflicting, remarks
-
     record = stored.record
     if record is None:
         return {"state": "refused", "model": None, "note": f": {stored.problem}"}
@@ -92,9 +90,6 @@ def _present(to: Path) -> list[tuple[Path, ResultRecord]]:
 
 def _question(record: ResultRecord) -> str:
     """Return what two records share when they answer the same question, the old one with what has since changed."""
-    from brainbench.scoring.demo import DEMOS
-    from brainbench.scoring.jobs import asked_settings
-
     origin = record.score.provenance
     # Files of one name hold other days of the same animals; a demo is known by its name, in each of its versions.
     source, title = (origin.recordings.get(name) for name in ("source", "title"))
@@ -115,9 +110,6 @@ def score_jobs(
     jobs: list[ScoringJob], to: Path, *, prune: bool, workers: int, scheduler: str | None
 ) -> list[dict[str, Any]]:
     """Score what a folder does not hold yet into it; with ``prune`` remove what a new score replaces."""
-    from brainbench.core.runs.jobs import run_jobs
-    from brainbench.scoring.jobs import missing
-
     if not jobs:
         return []
     done: list[dict[str, Any]] = []
@@ -182,8 +174,6 @@ def add(
     states other numbers for the same computation. Scores that are there already are not computed again, so an
     interrupted batch goes on where it stopped, and a stale one is renewed.
     """
-    from brainbench.scoring.jobs import jobs_of, parse_seeds, read_batch
-
     if not records and not model and batch is None:
         raise UsageError("Name record files to take in, or models to score with --model or --batch.")
     if options and batch is not None:

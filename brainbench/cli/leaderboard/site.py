@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from brainbench.cli.options import out_file_option, out_folder_option
 from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.core.errors import DataError, visible
-
-if TYPE_CHECKING:
-    from leaderboards.store import StoredRecord
+from leaderboards.audit import compare_builds, open_build
+from leaderboards.store import StoredRecord, read_records
 
 RECORDS = Path("brainbench-results")  # folder that is read where none is named
 
@@ -28,7 +27,6 @@ def build(
 ) -> Output:
     """Write the static site of a leaderboard: a folder of pages that need no server and no network."""
     from leaderboards.site.build import build_leaderboard
-    from leaderboards.store import read_records
 
     stored = read_records(records or [RECORDS], light=True)
     problems = _problems(stored)
@@ -54,7 +52,6 @@ def report(
     title: Annotated[str, typer.Option(help="Heading of the report.")] = "Leaderboard report",
 ) -> Output:
     """Write a report of result records as Markdown, HTML or PDF, with the citations as BibTeX beside it."""
-    from leaderboards.audit import open_build
     from leaderboards.report.paper import write_paper
 
     stored = open_build(*(records or [RECORDS]))
@@ -70,8 +67,6 @@ def diff(
     after: Annotated[Path, typer.Argument(help="The same, later.")],
 ) -> Output:
     """Show which models were added, removed or changed, which ranks moved, and what caused it."""
-    from leaderboards.audit import compare_builds, open_build
-
     old, new = open_build(before), open_build(after)
     changes = compare_builds(old, new)
     problems = _problems([*old, *new])

@@ -23,13 +23,17 @@ from brainbench.core.errors import BrainbenchError, DataError, UsageError, brief
 from brainbench.core.files import content_hash, private_folder, write_json
 from brainbench.core.limits import NotNegative, limited
 from brainbench.core.reading.regular import temporary_folder
+from brainbench.core.reading.values import typed_values
+from brainbench.core.records import ResultRecord, Score
+from brainbench.scoring.demo import DEMOS
+from brainbench.scoring.options import ScoreOptions
+from leaderboards.audit import differences, in_short, remarks
+from leaderboards.held_out import DATA, Commitment, digest, new_salt
+from leaderboards.ranking import standing_of
+from leaderboards.store import StoredRecord, read_records
 
 if TYPE_CHECKING:
     import xarray as xr
-
-    from brainbench.core.records import ResultRecord, Score
-    from leaderboards.held_out import Commitment
-    from leaderboards.store import StoredRecord
 
 PUBLIC = "public.h5"  # file of the public part
 FEWEST = {"animals": 2, "stimuli": 3}  # fewest on either side: less has no score
@@ -52,9 +56,7 @@ def hold_out(
     """
     from brainbench.datasets import write_recordings
     from brainbench.datasets.reading import find_recordings
-    from brainbench.scoring.demo import DEMOS
     from brainbench.scoring.neural_responses import open_neural_responses
-    from leaderboards.held_out import DATA, Commitment, digest, new_salt
 
     if (animals > 0) == (stimuli > 0):
         raise UsageError(f"Hold back either --animals or --stimuli; received {animals} and {stimuli}.")
@@ -104,7 +106,6 @@ def score_held_out(record: ResultRecord, commitment: Commitment, secret: Path) -
     The answer is rounded to two digits: many submissions shall learn little of the held-out part.
     """
     from brainbench.datasets import open_recordings
-    from brainbench.scoring.options import ScoreOptions
     from brainbench.scoring.scores import score_record
 
     held = open_recordings(commitment.open(secret))
@@ -121,8 +122,6 @@ def score_held_out(record: ResultRecord, commitment: Commitment, secret: Path) -
 
 
 def _two_digits(score: Score) -> dict[str, Any]:
-    from leaderboards.ranking import standing_of
-
     span = score.scaled_interval
     values = {"score": score.scaled, "low": span.low if span else math.nan, "high": span.high if span else math.nan}
     return {name: round(value, 2) if math.isfinite(value) else None for name, value in values.items()} | {
@@ -154,8 +153,6 @@ class Repetition:
 
     def commitment(self) -> Commitment | None:
         """Return the commitment, if there is one; one that is not usable, or a secret, is told before any score."""
-        from leaderboards.held_out import Commitment
-
         # An empty text too is none: workflows pass on a variable that a board may lack.
         if not self.held_out:
             return None
@@ -178,16 +175,12 @@ def verify(
     could do anything, and could read the answer, and a path in it could be that of any file. Exit status 1 if a file
     was edited, a repetition gives something else or cannot be made; what differs is printed.
     """
-    from leaderboards.store import read_records
-
     commitment = how.commitment()
     return verdicts(read_records(records), how, commitment)
 
 
 def verdicts(stored: Sequence[StoredRecord], how: Repetition, commitment: Commitment | None = None) -> Output:
     """Return what is found about records, with exit status 1 where one is refused, differs or is not repeated."""
-    from leaderboards.audit import differences, remarks
-
     doubts = remarks(stored)
     results: list[dict[str, Any]] = []
     for entry in tracked(stored, "records verified"):
@@ -216,8 +209,6 @@ def score_again(record: ResultRecord, how: Repetition) -> ResultRecord:
 
     Only demo recordings are found without ``how.recordings``, since records keep no folders.
     """
-    from brainbench.scoring.demo import DEMOS
-    from brainbench.scoring.options import ScoreOptions
     from brainbench.scoring.scores import score_record
 
     origin = record.score.provenance
@@ -252,8 +243,6 @@ def _additions(statistics: Mapping[str, Any]) -> dict[str, Any]:
 
 def _check_kinds(record: ResultRecord, model: Any, source: Any) -> None:
     """Raise DataError for settings of other kinds than the options of a score: anyone may have written the record."""
-    from brainbench.core.reading.values import typed_values
-
     origin = record.score.provenance
     stated: dict[str, tuple[Any, Any]] = {
         "model": (model, str),
@@ -295,8 +284,6 @@ def refuse_foreign_code(record: ResultRecord, *, trusted: bool, stimuli: str | N
 
 
 def _verdict(result: dict[str, Any]) -> str:
-    from leaderboards.audit import in_short
-
     words = {
         "confirmed": "confirmed: scored again with the same result",
         "intact": "intact: the file fits its hash (not scored again)",
@@ -355,8 +342,6 @@ def check_submission(
     folder, are refused, whatever git calls the change. New records are then verified as by leaderboard verify; nothing
     of the submission is run, and no file that a record names is opened. Exit status 1 if anything is refused.
     """
-    from leaderboards.store import read_records
-
     commitment = how.commitment()
     before, after = (_commit(name) for name in (base, head))
     folder = PurePosixPath(results)

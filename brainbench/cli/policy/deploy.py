@@ -10,6 +10,9 @@ import typer
 
 from brainbench.cli.options import option, out_file, with_options
 from brainbench.cli.output import Output, progress_bar
+from brainbench.core.errors import check_each
+from brainbench.core.limits import read_pairs, read_value
+from brainbench.core.plugins import require_optional
 
 if TYPE_CHECKING:
     from robotics_bridge.deploy.controller import DeployedPolicy
@@ -74,7 +77,6 @@ def deploy(
 
     Exit status 1: it was stopped for safety.
     """
-    from brainbench.core.plugins import require_optional
     from robotics_bridge.deploy.controller import check_duration, read_deployed, realtime
     from robotics_bridge.deploy.driver import DriverRequest, open_driver
     from robotics_bridge.tasks.settings import contacts_name
@@ -127,8 +129,6 @@ def deploy(
 
 def _inputs(deployed: DeployedPolicy, words: list[str]) -> dict[str, Any]:
     """Return group → its constant, as --input gives them."""
-    from brainbench.core.errors import check_each
-    from brainbench.core.limits import read_pairs, read_value
     from robotics_bridge.deploy.controller import constant
 
     wanted = [name for name in deployed.contract.inputs if name != "proprio"]

@@ -12,14 +12,16 @@ import typer
 from brainbench.cli.options import out_file, out_file_option, with_options
 from brainbench.cli.output import Output, facts, progress_bar, table_of
 from brainbench.cli.policy.train import ENV, ENVS_FLAG, TOUCH, World, agent_of, in_world, touch_of
+from brainbench.core.errors import check_number
+from brainbench.core.figures import check_format
 from brainbench.core.limits import Limit, Positive
+from robotics_bridge.policies.shipped import list_policies, stored
 
 
 def list_tasks() -> Output:
     """List the tasks with their success, length, observation groups, and the policies that come with the package."""
     from robotics_bridge import tasks
     from robotics_bridge.policies.contract import trained_contacts
-    from robotics_bridge.policies.shipped import list_policies, stored
     from robotics_bridge.tasks.settings import contacts_name
 
     rows = []
@@ -76,7 +78,6 @@ def play(
     video: Annotated[Path | None, typer.Option(callback=out_file, help="Write a film here (.mp4 or .gif).")] = None,
 ) -> Output:
     """Run an agent in one environment of a task and show what happens, as numbers and as a film."""
-    from brainbench.core.figures import check_format
     from robotics_bridge.tasks.settings import contacts_name
 
     world.check([agent])
@@ -150,7 +151,6 @@ def evaluate(
     touched the object (rad/s), the mean duration (s) and the share of episodes that a drop (or another ending of the
     task) ended.
     """
-    from brainbench.core.errors import check_number
     from robotics_bridge.policies.evaluate import evaluate as run
     from robotics_bridge.tasks.settings import contacts_name
 

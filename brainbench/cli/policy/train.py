@@ -13,6 +13,9 @@ import typer
 
 from brainbench.cli.options import filled_from, option, out_folder, out_folder_option, part_of, with_options
 from brainbench.cli.output import Output, facts, progress_bar, table, table_of
+from brainbench.core.errors import UsageError, check_name, unknown_name
+from brainbench.core.files import lock_folder, read_json
+from brainbench.core.plugins import load_module
 
 if TYPE_CHECKING:
     from robotics_bridge.envs import Env
@@ -43,7 +46,6 @@ class World:
 
     def check(self, agents: Iterable[str]) -> None:
         """Raise UsageError for an unknown task or agent, before anything slow is imported."""
-        from brainbench.core.errors import check_name, unknown_name
         from robotics_bridge import tasks
         from robotics_bridge.policies import shipped
 
@@ -73,8 +75,6 @@ class World:
 
 def read_task_file(file: Path | None) -> None:
     """Run a file that registers a task, if one is given."""
-    from brainbench.core.plugins import load_module
-
     if file is not None:
         load_module(str(file.absolute()))
 
@@ -106,7 +106,6 @@ def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
 
 def touch_of(names: list[str]) -> dict[str, Any]:
     """Return the tactile options of the student among some agents; nothing if there is none."""
-    from brainbench.core.errors import UsageError
     from robotics_bridge.policies.contract import from_json
     from robotics_bridge.policies.shipped import stored
 
@@ -257,8 +256,6 @@ def sweep(
 
     Start it once on each GPU, with the same folder: every process takes the next student that none has.
     """
-    from brainbench.core.errors import UsageError
-    from brainbench.core.files import lock_folder, read_json
     from robotics_bridge.policies.training.distill_config import PUBLISHED, read_sweep
     from robotics_bridge.policies.training.teacher import EVALUATION, is_done, success_of, train_student
 

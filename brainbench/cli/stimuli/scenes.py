@@ -5,22 +5,25 @@ Objects are shape families and mesh files; what whiskers touch of them is told.
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
 from brainbench.cli.options import SCORE, numbers, option, out_file, out_file_option, refuse, with_options
 from brainbench.cli.output import Output, facts, progress_bar, table
 from brainbench.core.errors import UsageError, check_name, choose_name
+from brainbench.core.figures import check_format
 from brainbench.core.reading.regular import readable
+from brainbench.geometry import UNITS, DecompositionSettings, Mesh, load_mesh, save_mesh, winding_number
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from brainbench.geometry import DecompositionSettings, Mesh
     from brainbench.stimuli import Scene, Solid
     from brainbench.stimuli.scenes.scene_files import Recipe
 
@@ -109,8 +112,6 @@ def _of_recipe(recipe: Recipe, scenes: list[Scene]) -> dict[str, Any]:
 
 
 def _of_file(dataset: xr.Dataset, stimulus: str | None) -> dict[str, Any]:
-    import json
-
     scenes = json.loads(dataset.attrs["scene"])
     labels = [scene["label"] for scene in scenes]
     if stimulus is not None:
@@ -230,8 +231,6 @@ def objects(
     ] = None,
 ) -> Output:
     """List the shape families, or describe one object: its size, its faults, and what whiskers touch of it."""
-    from brainbench.geometry import save_mesh
-
     diagonal = None if diagonal_mm is None else diagonal_mm / _MILLI
     if source is None:
         single = {"--unit": unit, "--diagonal-mm": diagonal_mm, "--collision": collision, "--export": export}
@@ -277,7 +276,6 @@ def _member(
 def _file(
     source: str, unit: str | None, diagonal: float | None, collision: str, settings: DecompositionSettings
 ) -> tuple[dict[str, Any], Solid]:
-    from brainbench.geometry import UNITS, load_mesh
     from brainbench.stimuli.objects.solid import mesh_solid
 
     if unit is None:
@@ -288,10 +286,6 @@ def _file(
 
 
 def _measures(mesh: Mesh, solid: Solid) -> dict[str, Any]:
-    import numpy as np
-
-    from brainbench.geometry import winding_number
-
     low, high = mesh.bounds
     # What two bodies share would count twice; the surface winds about it twice. Fine meshes get fewer points.
     points = low + (high - low) * np.random.default_rng(0).random((64 + 4_000_000 // len(mesh.faces), 3))
@@ -367,7 +361,6 @@ def render(
     backend: BackendOption = DEFAULT_ENGINE,
 ) -> Output:
     """Draw a scene: whiskers bent by its objects, as a picture or a film; no display is needed."""
-    from brainbench.core.figures import check_format
     from brainbench.stimuli.figures import pictures as drawing
     from brainbench.stimuli.figures.pictures import Style
     from brainbench.stimuli.figures.surfaces import Camera
@@ -417,7 +410,6 @@ def plot(
     backend: BackendOption = DEFAULT_ENGINE,
 ) -> Output:
     """Plot forces or moments of every whisker on the 5 × 7 layout, to one scale, contacts shaded."""
-    from brainbench.core.figures import check_format
     from brainbench.stimuli.figures.pictures import PLOT_FORMATS, QUANTITIES
     from brainbench.stimuli.figures.pictures import plot as draw
     from brainbench.stimuli.sources import load_stimulus_set

@@ -10,6 +10,7 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
 from brainbench.cli.options import (
@@ -87,8 +88,6 @@ def _percent(share: float | None) -> str:
 
 def _whiskers(dataset: Any, words: str) -> list[dict[str, str]]:
     """Return the whiskers that have words of a kind, ``reason`` or ``remark``, with them."""
-    import numpy as np
-
     bad = dataset[words].values != "" if words in dataset else np.zeros((0, 0), bool)
     return [
         {
@@ -102,8 +101,6 @@ def _whiskers(dataset: Any, words: str) -> list[dict[str, str]]:
 
 def _summary(dataset: Any) -> list[dict[str, Any]]:
     """Return, per stimulus, who touched, the largest force and moment, and the errors of those that touched."""
-    import numpy as np
-
     wrench = dataset["wrench"].values
     # Frames after a whisker became unstable are NaN; the rest of the set still has peaks.
     force = np.nanmax(np.linalg.norm(wrench[..., :3], axis=-1), axis=(1, 2), initial=0.0) * 1e3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -120,8 +121,6 @@ def check(
 
 def _check_hands(folder: Path, out: Path) -> Output:
     """Check every hand of a folder's files."""
-    from dataclasses import asdict
-
     from robotics_bridge.hands.gallery import check_file
 
     paths = [folder] if folder.is_file() else sorted(p for p in folder.rglob("*") if p.suffix.lower() in _HAND_FILES)
