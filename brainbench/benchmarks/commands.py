@@ -7,9 +7,15 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.benchmarks.opening import OPTIONS
+from brainbench.benchmarks.opening import OPTIONS, list_benchmarks
+from brainbench.benchmarks.opening import add as add_benchmark
+from brainbench.benchmarks.opening import check as check_benchmark
+from brainbench.benchmarks.opening import make as make_benchmark
+from brainbench.benchmarks.opening import pack as pack_benchmark
 from brainbench.cli.options import SCORE, SCORE_FLAGS, needs, out_file_option, with_options
 from brainbench.cli.output import Output, facts, progress_bar, table_of
+from brainbench.core.errors import UsageError
+from brainbench.core.files import write_text
 
 OPENING = "brainbench.benchmarks.opening"
 app = typer.Typer(no_args_is_help=True, help="Make, check and pack benchmarks: one file that others score on.")
@@ -32,10 +38,6 @@ def make(
     ] = None,
 ) -> Output:
     """Write a benchmark from the options that brainbench score would take: everything but the model."""
-    from brainbench.benchmarks.opening import make as make_benchmark
-    from brainbench.core.errors import UsageError
-    from brainbench.core.files import write_text
-
     if out.suffix != ".toml":
         raise UsageError(f"--out is a file that ends in .toml; received {out.name!r}. To make a .zip of it: pack.")
     with progress_bar() as progress:
@@ -53,8 +55,6 @@ def check(benchmark: NamedBenchmark) -> Output:
 
     Exit status 1 if anything is not as it states; what others will miss in it is named too.
     """
-    from brainbench.benchmarks.opening import check as check_benchmark
-
     with progress_bar() as progress:
         stated, findings = check_benchmark(benchmark, progress)
     wrong = any(finding.severity == "error" for finding in findings)
@@ -71,9 +71,6 @@ def pack(
     out: Annotated[Path, out_file_option("File to write, FILE.zip.")],
 ) -> Output:
     """Write a benchmark and all of its files into one .zip, which is all that a stranger needs."""
-    from brainbench.benchmarks.opening import pack as pack_benchmark
-    from brainbench.core.errors import UsageError
-
     if out.suffix != ".zip":
         raise UsageError(f"--out is a file that ends in .zip; received {out.name!r}.")
     stated = pack_benchmark(benchmark, out)
@@ -85,8 +82,6 @@ def pack(
 @app.command("list")
 def list_() -> Output:
     """List the benchmarks that have a name: those of installed packages, and those that you added."""
-    from brainbench.benchmarks.opening import list_benchmarks
-
     files = list_benchmarks()
     if not files:
         return Output({}, "No benchmark has a name here; give one its own: brainbench benchmark add FILE")
@@ -96,8 +91,6 @@ def list_() -> Output:
 @app.command("add")
 def add(benchmark: NamedBenchmark) -> Output:
     """Keep a benchmark with its files in your settings, so that brainbench score knows it by its name."""
-    from brainbench.benchmarks.opening import add as add_benchmark
-
     stated, path = add_benchmark(benchmark)
     text = f"{stated.name}  kept in {path}\n\nscore it: brainbench score MODEL --benchmark {stated.name}"
     return Output({"name": stated.name, "hash": stated.identity, "path": path}, text)

@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from brainbench.cli.output import Output, table
+from brainbench.core.devices import usable_processors
 from brainbench.core.errors import BrainbenchError, install_command
+from brainbench.core.files import CACHE_VARIABLE, cache_dir, check_folder, provenance
 
 ENABLES = {
     "nwb": "checks of NWB files against the schema and best practice",
@@ -46,9 +48,6 @@ def doctor() -> Output:
 def diagnose() -> dict[str, Any]:
     """Collect what :func:`doctor` shows."""
     import torch
-
-    from brainbench.core.devices import usable_processors
-    from brainbench.core.files import CACHE_VARIABLE, cache_dir, check_folder, provenance
 
     cache, problem, facts = None, None, provenance()
     try:

@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Any
 from brainbench.core.errors import DataError, FileWriteError, UsageError, brief
 from brainbench.core.reading.regular import user_path
 from brainbench.core.reading.texts import read_json, read_mapping  # noqa: F401 - also imported from here
+from brainbench.core.version import __version__
 
 if TYPE_CHECKING:
     import h5py
@@ -405,8 +406,6 @@ def library_versions() -> dict[str, str]:
 def provenance(**extra: Any) -> dict[str, Any]:
     """Return what a result needs to be made again: versions, machine, time, and what the caller adds."""
     import datetime
-
-    from brainbench.core.version import __version__
 
     return {
         "version": __version__,

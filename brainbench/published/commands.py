@@ -10,10 +10,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
 from brainbench.cli.options import beside, out_folder_option, refuse
 from brainbench.cli.output import Output, facts, progress_bar
+from brainbench.core.contracts import GRID_SHAPE
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing
 from brainbench.core.files import temporary_path
 
@@ -112,9 +114,6 @@ def _data_set(source: Path, out: Path) -> dict[str, Any]:
 
 def _sweep_set(paths: list[Path]) -> xr.Dataset:
     """Return a stimulus set of sweep files, which are called as the files are."""
-    import numpy as np
-
-    from brainbench.core.contracts import GRID_SHAPE
     from brainbench.published import conversion
     from brainbench.stimuli import Frames
 

@@ -16,6 +16,7 @@ from brainbench.cli.output import Output, facts, progress_bar, table, table_of
 from brainbench.core.errors import UsageError, check_name, unknown_name
 from brainbench.core.files import lock_folder, read_json
 from brainbench.core.plugins import load_module
+from robotics_bridge.policies.shipped import stored
 
 if TYPE_CHECKING:
     from robotics_bridge.envs import Env
@@ -88,7 +89,6 @@ def in_world(command: Callable[..., Output]) -> Callable[..., Output]:
 def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
     """Return the agent ``zero`` or ``random``, a shipped policy, or the teacher or student of a run's folder."""
     from robotics_bridge.policies import evaluate
-    from robotics_bridge.policies.shipped import stored
 
     if name in evaluate.AGENTS:
         return evaluate.agent(name, env, seed=seed)
@@ -107,7 +107,6 @@ def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
 def touch_of(names: list[str]) -> dict[str, Any]:
     """Return the tactile options of the student among some agents; nothing if there is none."""
     from robotics_bridge.policies.contract import from_json
-    from robotics_bridge.policies.shipped import stored
 
     touch: dict[str, dict[str, Any]] = {}
     for name in names:

@@ -7,6 +7,7 @@ import sys
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
 from brainbench.cli.options import SCORE, PlanOption, needs, option, option_fields, with_options
@@ -159,8 +160,6 @@ def _of_recordings(recordings: str, conditions: str | None) -> tuple[int, str, N
 
 
 def _of_model(model: str) -> tuple[int, str]:
-    import numpy as np
-
     from brainbench.scoring.model_responses import resolve_model
     from brainbench.scoring.options import ScoreOptions
     from brainbench.scoring.power.experiments import pattern_dimensions
