@@ -16,6 +16,7 @@ import inspect
 import math
 import os
 import re
+import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
@@ -311,6 +312,11 @@ def as_flags(kind: str, options: Any, flags: Mapping[str, tuple[str, ...]]) -> l
         else:
             words += [flag, ",".join(map(str, value)) if stated.several else str(value)]
     return words
+
+
+def score_command(model: str, options: Any) -> str:
+    """Return the command line that makes a score by itself."""
+    return shlex.join(["brainbench", "score", model, *as_flags(SCORE, options, SCORE_FLAGS)])
 
 
 def changed(kind: str, values: Mapping[str, Any]) -> dict[str, bool]:

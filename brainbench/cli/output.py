@@ -52,6 +52,14 @@ def _encodable_json(data: Any) -> str:
     return text
 
 
+def group(help: str, commands: Sequence[Callable[..., Output]], **options: Any) -> typer.Typer:
+    """Return a group of commands, called as their functions are; further options are typer's."""
+    app = typer.Typer(help=help, **options)
+    for command in commands:
+        app.command(command.__name__.rstrip("_").replace("_", "-"))(command)
+    return app
+
+
 def list_without_command(app: typer.Typer, command: Callable[[], Output]) -> None:
     """Let a group of commands run its listing when no command is named."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shlex
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -12,7 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.options import SCORE, SCORE_FLAGS, out_folder_option, report_file, typed_options, with_options
+from brainbench.cli.options import (
+    SCORE,
+    SCORE_FLAGS,
+    out_folder_option,
+    report_file,
+    score_command,
+    typed_options,
+    with_options,
+)
 from brainbench.cli.output import Output, progress_bar, table, table_of
 from brainbench.core.errors import UsageError
 from brainbench.core.files import to_plain
@@ -281,7 +288,7 @@ def score(
             raise UsageError("A file of stored splits is explained by itself; leave out all options but --json.")
         steps = to_plain(require_optional(PARTS, "explain_file", "part of a score")(model))
         return Output({"estimator_walk": steps}, walk_text(steps))
-    command = _command()
+    command = score_command(model, options)
     cached = record_path(model, options, command)
     record, note = read_kept(cached), "  (as scored before: nothing has changed since)"
     if record is None:
@@ -304,15 +311,3 @@ def score(
         data["paper_paths"] = write_paper([record], report, title=f"{record.score.name}: brainbench score")
         text += f"\npaper   {', '.join(map(str, data['paper_paths'][:2]))}"
     return Output(data, text)
-
-
-def _command() -> str:
-    """Return the command as typed, without what only says where and how to print."""
-    words = iter(sys.argv[1:])
-    typed = []
-    for word in words:
-        if word in ("--out", "-o", "--report"):
-            next(words, None)
-        elif word not in ("--json", "-v", "--verbose") and not word.startswith(("--out=", "--report=")):
-            typed.append(word)
-    return shlex.join(["brainbench", *typed])

@@ -14,7 +14,6 @@ from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import read_mapping
 from brainbench.core.progress import Progress
-from brainbench.models.training.config import TrainingConfig, best_run, sweep_runs
 
 if TYPE_CHECKING:
     from brainbench.datasets import WhiskingDataset
@@ -52,6 +51,8 @@ def train(
 
     Several GPUs: torchrun --nproc-per-node N -m brainbench train …
     """
+    from brainbench.models.training.config import TrainingConfig, best_run, sweep_runs
+
     options = (read_mapping(config) if config is not None else {}) | options
     if (stated := options.pop("model", model)) != model:
         raise UsageError(f"The configuration is for the model {stated!r} and the command names {model!r}.")

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import shlex
 from collections import defaultdict
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli.options import SCORE, SCORE_FLAGS, SchedulerOption, as_flags, out_folder, with_options
+from brainbench.cli.options import SCORE, SCORE_FLAGS, SchedulerOption, out_folder, score_command, with_options
 from brainbench.cli.output import Output, progress_bar
 from brainbench.core.errors import DataFileNotFoundError, UsageError, look_alike, visible
 from brainbench.core.files import to_json
@@ -97,13 +96,8 @@ def _question(record: ResultRecord) -> str:
     return to_json([record.score.name, title, brain, origin.pairing, asked_settings(origin.settings)])
 
 
-def command_of(job: ScoringJob) -> str:
-    """Return the command line that makes a job's score by itself."""
-    return shlex.join(["brainbench", "score", job.model, *as_flags(SCORE, job.options, SCORE_FLAGS)])
-
-
 def _run(job: ScoringJob) -> ResultRecord:
-    return job.run(command_of(job))
+    return job.run(score_command(job.model, job.options))
 
 
 def score_jobs(
@@ -188,7 +182,7 @@ def add(
     if batch is not None:
         jobs += read_batch(batch)
     # Patterns, entries and both flags may name a model twice.
-    jobs = list({command_of(job): job for job in jobs}.values())
+    jobs = list({score_command(job.model, job.options): job for job in jobs}.values())
     done = take_in(given_files(records or []), to, keep_both=keep_both)
     done += score_jobs(jobs, to, prune=prune, workers=workers, scheduler=scheduler)
     states = [item["state"] for item in done]

@@ -18,7 +18,7 @@ from brainbench.core.limits import Limit, Positive
 from robotics_bridge.policies.shipped import list_policies, stored
 
 
-def list_tasks() -> Output:
+def tasks_() -> Output:
     """List the tasks with their success, length, observation groups, and the policies that come with the package."""
     from robotics_bridge import tasks
     from robotics_bridge.policies.contract import trained_contacts

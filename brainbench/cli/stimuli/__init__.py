@@ -5,21 +5,14 @@
 
 from __future__ import annotations
 
-import typer
-
-from brainbench.cli.output import list_without_command
+from brainbench.cli.output import group, list_without_command
 from brainbench.cli.stimuli import scenes, simulate
 
-app = typer.Typer(help="Simulate whiskers on objects; look at scenes and forces.")
-app.command("list")(scenes.list_)
+app = group(
+    "Simulate whiskers on objects; look at scenes and forces.",
+    [
+        scenes.list_, scenes.show, simulate.simulate, simulate.sweep, simulate.separability, scenes.render, scenes.plot,
+        scenes.objects,
+    ],
+)  # fmt: skip
 list_without_command(app, scenes.list_)
-for _command in (
-    scenes.show,
-    simulate.simulate,
-    simulate.sweep,
-    simulate.separability,
-    scenes.render,
-    scenes.plot,
-    scenes.objects,
-):
-    app.command(_command.__name__)(_command)

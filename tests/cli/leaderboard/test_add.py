@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from brainbench.cli.leaderboard.add import command_of
+from brainbench.cli.options import score_command
 from brainbench.core.records import ResultRecord
 from brainbench.datasets import open_recordings, write_recordings
 from brainbench.scoring.jobs import read_batch
@@ -49,7 +49,8 @@ def test_features_with_labels_of_their_own_are_scored_once(run, files, tmp_path)
 def test_a_job_has_the_command_that_makes_its_score(tmp_path):
     batch = tmp_path / "b.toml"
     batch.write_text('[[entries]]\nmodels = ["s4-small"]\nseeds = [0, 1]\n')
-    assert [command_of(job) for job in read_batch(batch)][1] == "brainbench score s4-small --weights-seed 1"
+    job = read_batch(batch)[1]
+    assert score_command(job.model, job.options) == "brainbench score s4-small --weights-seed 1"
 
 
 def _forge(path: Path) -> Path:
