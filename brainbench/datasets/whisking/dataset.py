@@ -13,10 +13,10 @@ import threading
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -32,6 +32,7 @@ from brainbench.core.errors import (
     listing,
 )
 from brainbench.core.files import cache_dir, content_hash, hash_arrays, read_json
+from brainbench.core.limits import Count, Seed, limited
 from brainbench.core.plugins import load_optional
 from brainbench.core.progress import Progress, track
 from brainbench.core.reading.hdf5 import open_hdf5
@@ -211,9 +212,6 @@ def most_open() -> int:
     return max(16, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 2)
 
 
-View = Literal["grid", "raw"]
-Unstable = Literal["skip", "zero", "error"]
-
 SPLITS = ("train", "validation", "test", "all")  # values of `split`; `all` is the three together
 SWEEP_READERS = "brainbench.sweeps"  # entry points that open sweeps of others; the published study's are `published`
 
@@ -243,6 +241,8 @@ class ChannelStatistics:
     """Numbers per channel that were read."""
 
 
+@dataclass(eq=False, repr=False)
+@limited(names={"unstable": "treatment of unstable sweeps"}, unresolved=("device",))
 class WhiskingDataset:
     """Batches of sweeps of one split, in an order drawn anew in every epoch.
 
@@ -251,59 +251,48 @@ class WhiskingDataset:
 
     >>> data = WhiskingDataset("sweeps", split="train", batch_size=256, device="cuda")  # doctest: +SKIP
     >>> for x, y in data: ...  # doctest: +SKIP
-
-    Args:
-        folder: where ``brainbench stimuli sweep`` wrote, or a folder of published sweeps.
-        split: one of :data:`SPLITS`.
-        batch_size: B.
-        view: ``grid`` gives [B, T, S·C, H, W] as ``to_grid`` of a stimulus set does; ``raw`` [B, frame, W, C].
-        substeps: frames S that make one time step of the grid.
-        shuffle: draw the order from seed and epoch; in the order of the files when False.
-        seed: of the order.
-        device: where batches go, in the words of torch.
-        unstable: sweeps with a whisker whose simulation failed are left out (``skip``), their missing numbers read as
-            zero (``zero``), or refused (``error``). Sweeps without any forces are always left out.
-        drop_last: leave out the last batch of an epoch when it is smaller.
-        part: (rank, number of processes): each process reads another part of every epoch, all equally many batches.
     """
 
-    def __init__(
-        self,
-        folder: str | os.PathLike[str],
-        *,
-        split: str = "train",
-        batch_size: int = 256,
-        view: View = "grid",
-        substeps: int = 5,
-        shuffle: bool = True,
-        seed: int = 0,
-        device: str | torch.device = "cpu",
-        unstable: Unstable = "skip",
-        drop_last: bool = False,
-        part: tuple[int, int] = (0, 1),
-    ) -> None:
-        for kind, value, allowed in (
-            ("split", split, SPLITS),
-            ("view", view, get_args(View)),
-            ("treatment of unstable sweeps", unstable, get_args(Unstable)),
-        ):
-            check_name(kind, value, allowed)
-        for name, value, least in (("batch_size", batch_size, 1), ("substeps", substeps, 1), ("seed", seed, 0)):
-            check_number(name, value, least=least, whole=True)
+    folder: str | os.PathLike[str]
+    """Where ``brainbench stimuli sweep`` wrote, or a folder of published sweeps."""
+    _: KW_ONLY
+    split: str = "train"
+    """One of :data:`SPLITS`."""
+    batch_size: Count = 256
+    """B."""
+    view: Literal["grid", "raw"] = "grid"
+    """``grid`` gives [B, T, S·C, H, W] as ``to_grid`` of a stimulus set does; ``raw`` [B, frame, W, C]."""
+    substeps: Count = 5
+    """Frames S that make one time step of the grid."""
+    shuffle: bool = True
+    """Draw the order from seed and epoch; in the order of the files when False."""
+    seed: Seed = 0
+    """Of the order."""
+    device: str | torch.device = "cpu"
+    """Where batches go, in the words of torch."""
+    unstable: Literal["skip", "zero", "error"] = "skip"
+    """Sweeps with a whisker whose simulation failed are left out (``skip``), their missing numbers read as zero
+    (``zero``), or refused (``error``). Sweeps without any forces are always left out."""
+    drop_last: bool = False
+    """Leave out the last batch of an epoch when it is smaller."""
+    part: tuple[int, int] = (0, 1)
+    """(rank, number of processes): each process reads another part of every epoch, all equally many batches."""
+
+    def __post_init__(self) -> None:
+        """Open the shards of the split."""
+        split, view, substeps, part = self.split, self.view, self.substeps, self.part
+        check_name("split", split, SPLITS)
         if not 0 <= part[0] < part[1]:
             raise UsageError(f"A part is (rank, number) with 0 ≤ rank < number; received {part!r}.")
-        self.folder = Path(folder)
-        self.split, self.view, self.substeps, self.unstable = split, view, substeps, unstable
-        self.batch_size, self.shuffle, self.seed, self.device = batch_size, shuffle, seed, device
-        self.drop_last, self.part = drop_last, part
-        read = load_optional(SWEEP_READERS, "published", "reader of sweeps") if is_sweep_tree(self.folder) else None
-        tree = None if read is None else read(self.folder)
-        self.manifest: Mapping[str, Any] = read_manifest(self.folder) if tree is None else tree.manifest()
+        self.folder = folder = Path(self.folder)
+        read = load_optional(SWEEP_READERS, "published", "reader of sweeps") if is_sweep_tree(folder) else None
+        tree = None if read is None else read(folder)
+        self.manifest: Mapping[str, Any] = read_manifest(folder) if tree is None else tree.manifest()
         self.classes = tuple(str(name) for name in self.manifest["classes"])
         entries = [item for item in self.manifest["shards"] if split in ("all", item["split"])]
         self._splits = np.array([item["split"] for item in entries])
         if tree is None:
-            self._shards = [open_shard(self.folder / item["name"], item, self.manifest) for item in entries]
+            self._shards = [open_shard(folder / item["name"], item, self.manifest) for item in entries]
         else:
             self._shards = [tree.open_shard(item["split"]) for item in entries]
         self._choose()
@@ -319,8 +308,8 @@ class WhiskingDataset:
             raise UsageError("The data set has two whiskers in one cell of the grid; read it with view='raw'.")
         if not len(self):
             raise UsageError(
-                f"The {self.sweeps} sweeps of the split {split!r} make no batch of {batch_size} for each of {part[1]} "
-                "processes; choose a smaller batch, or keep the last one."
+                f"The {self.sweeps} sweeps of the split {split!r} make no batch of {self.batch_size} for each of "
+                f"{part[1]} processes; choose a smaller batch, or keep the last one."
             )
 
     def _choose(self) -> None:
