@@ -31,14 +31,15 @@ ESTIMATOR_VERSION = 5
 """Raised whenever the same recordings and activations would get another number from the default estimator."""
 
 _ROUNDING = 1e-6
-_LARGEST = 1e100  # largest absolute number of a score: squares and sums of such are still finite
+_LARGEST = 1e100  # largest absolute number of a record: squares and sums of such are still finite
 
 if TYPE_CHECKING:
-    Number = Share = float
+    Number = Reliability = Share = float
     Count = int
 else:
     # JSON has no NaN: a number without value is written as null, and read back as NaN (NullIsNaN).
-    Number = float | None
+    Number = Annotated[float, msgspec.Meta(ge=-_LARGEST, le=_LARGEST)] | None
+    Reliability = Annotated[float, msgspec.Meta(ge=-_LARGEST, le=1 + _ROUNDING)] | None
     Share = Annotated[float, msgspec.Meta(ge=0, le=1)] | None
     Count = Annotated[int, msgspec.Meta(ge=0)]
 
@@ -58,7 +59,7 @@ class NullIsNaN:
 @cache
 def _numbers(kind: Any) -> list[tuple[str, bool]]:
     """Return the names of a dataclass' numbers, true, and tuples of numbers, false."""
-    alone = {"Number": True, "Share": True, "tuple[Number, ...]": False}
+    alone = {"Number": True, "Reliability": True, "Share": True, "tuple[Number, ...]": False}
     return [(slot.name, alone[str(slot.type)]) for slot in fields(kind) if slot.type in alone]
 
 
@@ -111,7 +112,7 @@ class SubjectScore(NullIsNaN):
     """Noise-corrected score; NaN when undefined."""
     r: Number
     """Raw comparison of the model's RDM with this animal's."""
-    reliability: Number
+    reliability: Reliability
     """Share of this animal's squared RDM that is no noise, from halves of its trials."""
     status: Status = "ok"
     units: Count = 0
@@ -190,7 +191,7 @@ class Score(NullIsNaN, _Document):
     """Reasons why it is not ``ok``, and what else a reader must know, in words."""
     r: Number = math.nan
     """Mean raw comparison over animals."""
-    reliability: Number = math.nan
+    reliability: Reliability = math.nan
     """Mean reliability over animals."""
     reliability_interval: Interval | None = None
     """Interval of ``reliability``, over animals."""
@@ -498,7 +499,7 @@ def _check_rest(data: Any, built: Any, place: str) -> None:
 
 
 def _contradiction(score: Score) -> str | None:
-    """Return what cannot be true at once, or None. These rules are beyond what JSON Schema can say."""
+    """Return what cannot be true at once, or None; what JSON Schema can say stands at the fields."""
     if math.isnan(score.value) != (score.status == "undefined"):
         return f"the status is {score.status!r} but the value is {score.value}"
     count = len(score.stimuli)
@@ -513,21 +514,9 @@ def _contradiction(score: Score) -> str | None:
             return f"{name} runs from {interval.low} down to {interval.high}"
     if score.p <= 0 or score.p < score.p_smallest * (1 - 1e-9):
         return f"p is {score.p} but the smallest possible is {score.p_smallest}"
-    return _out_of_range(score)
-
-
-def _out_of_range(score: Score) -> str | None:
-    """Return the first number that no score can have, in words, or None; NaN is a number without value."""
-    if score.reliability > 1 + _ROUNDING or any(one.reliability > 1 + _ROUNDING for one in score.subjects):
-        return "a reliability is above 1"
     if str(score.provenance.settings.get("metric")).startswith("rsa"):  # correlations
         ends = (score.ceiling.lower, score.ceiling.upper) if score.ceiling else ()
         compared = (score.r, *ends, *(one.r for one in (*score.subjects, *score.layers)))
         if any(abs(r) > 1 + _ROUNDING for r in compared):
             return "a raw comparison (r, or its ceiling) is outside -1 to 1"
-    intervals = [score.interval, score.reliability_interval, *(layer.interval for layer in score.layers)]
-    numbers = [score.value, score.r, score.chance, score.attainable, score.best_layer_value, *score.without_stimulus]
-    numbers += [*score.model_rdm, *score.brain_rdm, *(one.value for one in (*score.subjects, *score.layers))]
-    numbers += [end for one in intervals if one for end in (one.low, one.high)]
-    largest = max(map(abs, filter(math.isfinite, numbers)), default=0.0)
-    return f"a number is as large as {largest}" if largest > _LARGEST else None
+    return None
