@@ -66,7 +66,6 @@ _DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)", re.IGNORECASE)  # o
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,79}")
 
 
-@dataclass(frozen=True)
 @limited(of="{} of the recordings of a benchmark")
 class Recordings:
     """Recordings of a benchmark, and where they come from."""
@@ -86,7 +85,6 @@ class Recordings:
     """Licence of the recordings."""
 
 
-@dataclass(frozen=True)
 @limited(of="{} of the ceiling of a benchmark")
 class Ceilings:
     """What the recordings allow: numbers that do not depend on a model."""
@@ -103,7 +101,6 @@ class Ceilings:
     """Each animal against the mean of all."""
 
 
-@dataclass(frozen=True)
 @limited(of="{} of a benchmark", unresolved=("held_out",))
 class Benchmark:
     """Everything that a score needs but the model."""

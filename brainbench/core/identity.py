@@ -98,7 +98,6 @@ def unusual_settings(stated: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value not in (None, SETTINGS[name])}
 
 
-@dataclass(frozen=True)
 @limited(of="{} of a plan")
 class SealedPlan:
     """What an experiment will compare, stated before it is done."""

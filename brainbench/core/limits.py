@@ -3,7 +3,6 @@
 Construction checks them (:func:`limited`), msgspec reads the same annotations where files are converted, and the
 command line where options are made from the dataclass::
 
-    @dataclass(frozen=True)
     @limited
     class Stepping:
         step: Annotated[float, Limit(above=0, most=5e-3, unit="s")] = 1e-4
@@ -22,10 +21,10 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cache, wraps
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, overload
+from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform, get_args, get_origin, overload
 
 import msgspec
 
@@ -75,18 +74,22 @@ def limited(cls: type[T]) -> type[T]: ...
 
 @overload
 def limited(
-    *, of: str = ..., names: Mapping[str, str] | None = ..., unresolved: Sequence[str] = ...
-) -> Callable[[type[T]], type[T]]: ...
+    *, of: str = ..., names: Mapping[str, str] | None = ..., unresolved: Sequence[str] = ..., frozen: bool = ...,
+    eq: bool = ..., repr: bool = ..., kw_only: bool = ...,
+) -> Callable[[type[T]], type[T]]: ...  # fmt: skip
 
 
+@dataclass_transform(frozen_default=True, field_specifiers=(field,))
 def limited(
     cls: type | None = None,
     *,
     of: str = "{}",
     names: Mapping[str, str] | None = None,
     unresolved: Sequence[str] = (),
+    frozen: bool = True,
+    **options: bool,
 ) -> Any:
-    """Let a dataclass check the limits of its fields when it is made; stands below ``@dataclass``.
+    """Make a class a frozen dataclass that checks the limits of its fields when one is made.
 
     What its own ``__post_init__`` checks, relations between fields, comes after.
 
@@ -95,12 +98,14 @@ def limited(
         of: text with braces for the field's name in messages, for instance ``"{} of a whisker"``.
         names: field → what messages call it, where that is not its own name.
         unresolved: fields without limits whose annotation names types that are imported for type checkers alone.
+        frozen: False for a class whose fields may be set.
+        options: further options of :func:`dataclasses.dataclass`: ``eq``, ``repr`` and ``kw_only``.
     """
 
     def decorate(cls: type) -> type:
         """Give a class the checks of its fields' limits, ahead of its own."""
         if "__dataclass_fields__" in vars(cls):
-            raise TypeError(f"@limited stands below @dataclass on {cls.__qualname__}, or it would check nothing.")
+            raise TypeError(f"@limited makes a dataclass itself; take @dataclass off {cls.__qualname__}.")
         relations = vars(cls).get("__post_init__", getattr(cls, "__post_init__", None))
 
         def __post_init__(self: Any, *values: Any) -> None:
@@ -115,7 +120,7 @@ def limited(
         cls.__limits_of__ = of  # type: ignore[attr-defined]
         cls.__limit_names__ = {**getattr(cls, "__limit_names__", {}), **(names or {})}  # type: ignore[attr-defined]
         cls.__unresolved__ = (*getattr(cls, "__unresolved__", ()), *unresolved)  # type: ignore[attr-defined]
-        return cls
+        return dataclass(frozen=frozen, **options)(cls)
 
     return decorate if cls is None else decorate(cls)
 

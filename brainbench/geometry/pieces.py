@@ -11,7 +11,6 @@ from brainbench.core.plugins import require_optional
 from brainbench.geometry.mesh import Deviation, Mesh
 
 
-@dataclass(frozen=True)
 @limited
 class DecompositionSettings:
     """Method and limits by which a mesh is cut; a value outside its range is a :class:`UsageError`."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -35,7 +35,6 @@ _ELSEWHERE = ("recordings", "match", "by", "explain", "title", "strict", "memory
 ``benchmark``), or in none."""
 
 
-@dataclass(frozen=True)
 @limited(
     names={"time": "time rule"},
     unresolved=("recordings", "stimuli", "match", "select", "window", "fidelity", "metric", "layers", "benchmark"),

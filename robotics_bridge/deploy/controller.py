@@ -290,7 +290,6 @@ LARGEST_SCALE = 1e6  # largest scale or threshold of a pressure calibration
 _Scale = Annotated[float, Limit(least=-LARGEST_SCALE, most=LARGEST_SCALE)]
 
 
-@dataclass(frozen=True)
 @limited(of="'{}' of a pressure calibration")
 class PressureCalibration:
     """From the maker's contact pressure to the simulator's ``agg_force``; the published values."""

@@ -26,8 +26,7 @@ DRIFT = 2e-4
 its own. A delay that grows more slowly than this is not seen."""
 
 
-@dataclass(frozen=True, eq=False)
-@limited(of="The safety limit '{}'")
+@limited(of="The safety limit '{}'", eq=False)
 class SafetyLimits:
     """Limits of joints, readings and timing.
 

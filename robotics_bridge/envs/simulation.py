@@ -13,7 +13,7 @@ from __future__ import annotations
 import contextlib
 import gc
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -36,8 +36,7 @@ from robotics_bridge.tasks.task import Task
 ENGINES = ("mujoco", "warp")
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited
+@limited(kw_only=True)
 class EnvOptions:
     """Options of the simulation of a task, and of what is observed; a value that is not valid is a UsageError."""
 

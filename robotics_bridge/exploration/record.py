@@ -98,8 +98,7 @@ it."""
 _DENSE = 2e5  # density of explored objects (kg/m³): contacts must not move what is held
 
 
-@dataclass(frozen=True, eq=False)
-@limited(of="{} of an explored object", unresolved=("geometry",))
+@limited(of="{} of an explored object", unresolved=("geometry",), eq=False)
 class Explored:
     """An object to explore."""
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Hashable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 Convention = Literal["physical", "thesis"]
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited
+@limited(kw_only=True)
 class Sensor(abc.ABC):
     """Configuration of a sensor on one link."""
 
@@ -87,8 +86,7 @@ class Sensor(abc.ABC):
         return frozenset()
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited
+@limited(kw_only=True)
 class ProbeSensor(Sensor):
     """A sensor made of probes that look at geometries of other links."""
 
@@ -131,8 +129,7 @@ class ProbeSensor(Sensor):
         return tuple(sorted({g for link in self.track for g in scene.geometries_of(link)}))
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited
+@limited(kw_only=True)
 class QuerySensor(ProbeSensor):
     """A probe sensor that asks for distances, by fields or by triangles."""
 
@@ -159,7 +156,6 @@ TABLE = Path(__file__).with_name("fidelity_table.json")
 """The measured settings that ship with the package."""
 
 
-@dataclass(frozen=True)
 @limited
 class SensorFidelity:
     """Settings that trade exactness for speed; the rest of a sensor is its own."""

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import abc
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
 from brainbench.core.errors import UsageError
@@ -23,8 +22,7 @@ _Turn = Annotated[float, Limit(least=-TURN, most=TURN, unit="rad")]
 _Half = Annotated[float, Limit(least=-math.pi, most=math.pi, unit="rad")]
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited(of="{} of a goal")
+@limited(of="{} of a goal", kw_only=True)
 class Goal(abc.ABC):
     """An orientation to reach; a new one is proposed as soon as it is."""
 
@@ -69,8 +67,7 @@ class Goal(abc.ABC):
         """Return the goals [B, 4] that follow the present ones; ``draw`` [B, 2] are uniform numbers in [0, 1)."""
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited(of="{} of a goal")
+@limited(of="{} of a goal", kw_only=True)
 class SteppingRotation(Goal):
     """Each goal lies one step further about a fixed world axis than the last."""
 
@@ -99,8 +96,7 @@ class SteppingRotation(Goal):
         return multiply(turn.expand_as(goal), goal)
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited(of="{} of a goal")
+@limited(of="{} of a goal", kw_only=True)
 class TimedRotation(Goal):
     """Each goal is the object's orientation at the time, tilted at random about x and y, to be reached in time."""
 

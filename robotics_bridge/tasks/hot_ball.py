@@ -9,7 +9,7 @@ F finger link with a grid, K ball.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any, Literal
 
@@ -34,8 +34,7 @@ from robotics_bridge.tasks.terms import StepContext, TaskScene
 _Celsius = Annotated[float, Limit(least=ABSOLUTE_ZERO, unit="°C")]
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited(of="{} of the hot ball")
+@limited(of="{} of the hot ball", kw_only=True)
 class ThermalSettings:
     """Materials of fingers and balls. The first four numbers are the axes of figure 4.8 and section 4.6.3."""
 

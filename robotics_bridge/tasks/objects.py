@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from brainbench.core.devices import mujoco_module
@@ -22,7 +22,6 @@ LARGEST = 3.0  # half size above which numbers of a hand's object look like mill
 _SIZES = {"box": 3, "cylinder": 2, "capsule": 2, "sphere": 1}
 
 
-@dataclass(frozen=True)
 @limited(of="{} of an object")
 class ObjectShape:
     """One object: its solids and its outer measures."""

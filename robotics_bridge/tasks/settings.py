@@ -8,7 +8,6 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from brainbench.core.errors import UsageError, brief, check_each, check_numbers
@@ -49,8 +48,7 @@ def check_parameters(of: str, function: Callable[..., Any], given: Iterable[str]
         raise UsageError(f"The {of} cannot be called: {error}.") from None
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited(of="contacts.{}")
+@limited(of="contacts.{}", kw_only=True)
 class ContactModel:
     """Compliance of all contacts (MuJoCo's ``solref`` and ``solimp``), physics steps, and the scale of the drives."""
 
@@ -102,8 +100,7 @@ LearningRate = Annotated[float, Limit(above=0, most=1)]
 Loss = Literal["mse", "inv_var_mse"]
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited(of="{} of a teacher")
+@limited(of="{} of a teacher", kw_only=True)
 class TeacherSettings:
     """PPO of the privileged teacher, upper half of table 4.4."""
 
@@ -197,8 +194,7 @@ class TeacherSettings:
         }
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited(of="{} of a student")
+@limited(of="{} of a student", kw_only=True)
 class StudentSettings:
     """DAgger distillation of the tactile student, lower half of table 4.4."""
 
@@ -216,7 +212,6 @@ class StudentSettings:
     """``inv_var_mse``: each action's squared error over the variance of the teacher's action in the rollout."""
 
 
-@dataclass(frozen=True)
 @limited(of="{} of a decoder")
 class AuxiliaryDecoder:
     """A head that predicts an observation group from the student's latent (table 4.5)."""

@@ -54,8 +54,7 @@ class Ending:
     params: Mapping[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited(of="actuators.{}")
+@limited(of="actuators.{}", kw_only=True)
 class ActuatorRandomisation:
     """Imperfections of the drives, drawn anew at every reset (thesis, text above table 4.9)."""
 
@@ -79,8 +78,7 @@ class ActuatorRandomisation:
     """Half width of white noise in every physics step, in units of the joint's effort."""
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited(of="object_changes.{}")
+@limited(of="object_changes.{}", kw_only=True)
 class ObjectRandomisation:
     """Differences between objects (thesis, table 4.9)."""
 
@@ -94,8 +92,7 @@ class ObjectRandomisation:
     """Draw friction and mass anew at every reset, or once."""
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited(of="push.{}")
+@limited(of="push.{}", kw_only=True)
 class Push:
     """A random force on the object, for one physics step each time (thesis, table 4.9)."""
 
@@ -109,8 +106,7 @@ class Push:
     """Time from one push to the next [s]; a control step at least."""
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited(of="placement.{}")
+@limited(of="placement.{}", kw_only=True)
 class Placement:
     """Start of the object: its lowest point at a height, with random position and yaw."""
 
@@ -130,8 +126,7 @@ class Placement:
         object.__setattr__(self, "quaternion", unit_vector("placement.quaternion", self.quaternion, 4))
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited(of="solver.{}")
+@limited(of="solver.{}", kw_only=True)
 class Solver:
     """Exactness of the physics (as in the released settings)."""
 
@@ -147,8 +142,7 @@ class Solver:
     """Improvement below which it stops (as MuJoCo's ``opt.tolerance``)."""
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited(of="noise.{}")
+@limited(of="noise.{}", kw_only=True)
 class ObservationNoise:
     """Gaussian noise of the measured proprioception (released settings)."""
 
@@ -158,8 +152,7 @@ class ObservationNoise:
     """On the velocity as observed, after its factor of 0.2."""
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited(of="success.{}")
+@limited(of="success.{}", kw_only=True)
 class Success:
     """Success of an episode."""
 
@@ -170,8 +163,7 @@ class Success:
     """Smallest value of the metric that is a success."""
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited(of="{} of a task")
+@limited(of="{} of a task", kw_only=True)
 class Task:
     """Everything that makes a task. Change one with ``dataclasses.replace``."""
 

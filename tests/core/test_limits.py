@@ -9,7 +9,7 @@ import inspect
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, FrozenInstanceError, dataclass, field, fields
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
@@ -158,10 +158,9 @@ def test_every_class_with_limits_checks_them_when_it_is_made(module: str):
             yield from below(inner)
 
     for cls in {inner for base in _classes(module) for inner in below(base)}:
-        assert getattr(cls.__post_init__, "checks_limits", False), f"{cls.__name__} needs @limited below @dataclass"
+        assert getattr(cls.__post_init__, "checks_limits", False), f"{cls.__name__} checks nothing"
 
 
-@dataclass(frozen=True)
 @limited(of="{} of a grid")
 class Grid:
     step: Annotated[float, Limit(above=0, most=5e-3, unit="m")] = 1e-4
@@ -219,7 +218,6 @@ def test_files_and_words_read_the_same_annotations():
 
 
 def test_an_annotation_that_cannot_be_resolved_is_an_error_of_the_class():
-    @dataclass(frozen=True)
     @limited
     class Broken:
         step: NoSuchLimit = 1.0  # type: ignore[name-defined] # noqa: F821
@@ -229,7 +227,6 @@ def test_an_annotation_that_cannot_be_resolved_is_an_error_of_the_class():
 
 
 def test_limits_that_nothing_reads_are_an_error_of_the_class():
-    @dataclass(frozen=True)
     @limited
     class Misplaced:
         step: Annotated[int | None, Limit(least=1)] = None
@@ -238,12 +235,14 @@ def test_limits_that_nothing_reads_are_an_error_of_the_class():
         Misplaced()
 
 
-def test_the_decorator_stands_below_dataclass():
-    with pytest.raises(TypeError, match="stands below @dataclass"):
+def test_the_decorator_makes_the_dataclass_itself():
+    assert fields(Solver)[0].name == "step"
+    with pytest.raises(FrozenInstanceError):
+        Solver().step = 1.0  # type: ignore[misc]
+    with pytest.raises(TypeError, match="take @dataclass off Late"):
         limited(dataclass(type("Late", (), {"__annotations__": {"step": float}})))
 
 
-@dataclass(frozen=True)
 @limited
 class Solver:
     step: Annotated[float, Limit(above=0)] = 1e-3
@@ -255,7 +254,7 @@ class Solver:
 @dataclass(frozen=True)
 class Job:
     name: str = "press"
-    solver: Solver = Solver()
+    solver: Solver = field(default_factory=Solver)
     corner: tuple[float, float] = (0.0, 0.0)
     sizes: tuple[int, ...] = (1,)
 
@@ -300,7 +299,6 @@ def test_values_without_annotation_are_read_like_the_present_ones():
     assert read_value("limit", "3", kind_of(None)) == 3.0
 
 
-@dataclass(frozen=True)
 @limited(of="{} of a draw")
 class _Draw:
     span: Annotated[tuple[float, float], Limit(rising=True)] | None = None

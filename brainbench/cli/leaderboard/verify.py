@@ -129,7 +129,6 @@ def _two_digits(score: Score) -> dict[str, Any]:
     }
 
 
-@dataclass(frozen=True)
 @limited
 class Repetition:
     """How records are scored again."""

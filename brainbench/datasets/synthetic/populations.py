@@ -40,7 +40,6 @@ from brainbench.datasets.sessions import Session, make_session
 MODULATION = 0.4  # largest modulation: beyond it too many rates would be cut off at zero for the truth to hold
 
 
-@dataclass(frozen=True)
 @limited
 class PopulationDesign:
     """Size of synthetic recordings, and how noisy they are; the defaults make RDMs of about half reliability."""

@@ -123,7 +123,6 @@ def _check_texts(what: str, texts: Any) -> None:
         raise UsageError(f"{what} must be a tuple of texts; received {brief(texts)}.")
 
 
-@dataclass(frozen=True)
 @limited(of="{} of a rule")
 class Rule:
     """One condition on one column; rows that fail it are removed and counted.
@@ -198,7 +197,6 @@ class Rule:
         return keep
 
 
-@dataclass(frozen=True)
 @limited
 class Selection:
     """Rules for trials and units. Each row is counted under the first rule that removes it."""
@@ -355,7 +353,6 @@ _UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
 _WITH_UNIT = re.compile(r"(?P<number>[+-]\d*\.?\d+) ?(?P<unit>s|sec|ms|us|µs)$", re.IGNORECASE)
 
 
-@dataclass(frozen=True)
 @limited(of="A window's {}")
 class Window:
     """The part of each trial that is read, [anchor + offset, end), in seconds.

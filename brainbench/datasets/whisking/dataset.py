@@ -241,8 +241,7 @@ class ChannelStatistics:
     """Numbers per channel that were read."""
 
 
-@dataclass(eq=False, repr=False)
-@limited(names={"unstable": "treatment of unstable sweeps"}, unresolved=("device",))
+@limited(names={"unstable": "treatment of unstable sweeps"}, unresolved=("device",), frozen=False, eq=False, repr=False)
 class WhiskingDataset:
     """Batches of sweeps of one split, in an order drawn anew in every epoch.
 

@@ -281,7 +281,6 @@ _LEAST_WITHOUT = 0.25
 """Smallest reliability without a stimulus, as a share of that with all, which the jackknife divides by."""
 
 
-@dataclass(frozen=True)
 @limited
 class RSA(Metric):
     """Compare RDMs; corrected by the split-half reliability of each animal's RDM.

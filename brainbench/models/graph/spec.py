@@ -24,8 +24,7 @@ Margins = tuple[Annotated[int, Limit(least=0)], Annotated[int, Limit(least=0)]]
 """Rows, columns at every edge."""
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited
+@limited(kw_only=True)
 class Operation:
     """Options that all operations share; one out of its range is a :class:`UsageError`."""
 
@@ -46,7 +45,6 @@ class Operation:
         raise NotImplementedError
 
 
-@dataclass(frozen=True)
 @limited(of="{} of a convolution")
 class Convolution(Operation):
     """2-D convolution of the concatenated inputs; a size out of its range is a :class:`UsageError`."""
@@ -70,7 +68,6 @@ class Convolution(Operation):
         return (self.channels, *((length + 2 * pad - size) // step + 1 for length, pad, size, step in windows))
 
 
-@dataclass(frozen=True)
 @limited(of="{} of a dense layer")
 class Dense(Operation):
     """Linear layer of the flattened, concatenated inputs."""
@@ -85,7 +82,6 @@ class Dense(Operation):
         return (self.features,)
 
 
-@dataclass(frozen=True)
 @limited(of="{} of a memory")
 class Memory:
     """A recurrent cell of :mod:`brainbench.models.cells`, channels unchanged."""
@@ -101,7 +97,6 @@ class Memory:
     """Let training change the time decay; other kinds ignore it."""
 
 
-@dataclass(frozen=True)
 @limited(of="{} of a pool")
 class Pool:
     """Pooling at the end of a node: ``max``, or ``average`` to a fixed output size."""

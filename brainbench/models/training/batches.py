@@ -41,7 +41,6 @@ MOUSE = tuple(row * GRID_SHAPE[1] + col for row, last in enumerate(LAST_COLUMNS)
 _MIRRORED = {"vertical": "z", "horizontal": "y"}
 
 
-@dataclass(frozen=True)
 @limited(of="{} of an augmentation")
 class Augmentation:
     """Change of every sample at training time."""

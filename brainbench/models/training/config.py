@@ -7,7 +7,7 @@ that share the folder. Importing this module imports no framework.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -30,7 +30,6 @@ from brainbench.models.training.checkpoints import DType
 _Times = Annotated[int, Limit(least=0, most=2**31 - 1)]
 
 
-@dataclass(frozen=True)
 @limited
 class TrainingConfig:
     """One training run. :meth:`published` fills in the published recipe."""

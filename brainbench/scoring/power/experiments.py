@@ -150,7 +150,6 @@ _EXACT_STIMULI = 6  # up to this many stimuli all orders are taken
 _CHUNK_ELEMENTS = 1 << 21
 
 
-@dataclass(frozen=True)
 @limited
 class ExperimentDesign:
     """An experiment, and the truth it is to find."""

@@ -207,7 +207,6 @@ def plot_confusion(recovery: Recovery, path: str | os.PathLike[str]) -> Path:
 SMALLEST_RDM = 4  # fewest stimuli whose RDMs can be compared after one is left out
 
 
-@dataclass(frozen=True)
 @limited(of="{} of a recovery")
 class RecoveryDesign:
     """An experiment that is repeated on the computer with every candidate in turn as the truth."""

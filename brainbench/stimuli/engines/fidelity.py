@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cache
 from importlib import resources
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -31,7 +31,6 @@ LARGEST_DAMPING = 1.15
 """Damping ratio of the steps over what was asked for beyond which a warning comes."""
 
 
-@dataclass(frozen=True)
 @limited
 class Fidelity:
     """Accuracy knobs of a whisker simulation; a value outside its range is a :class:`UsageError`."""

@@ -12,7 +12,6 @@ import math
 import os
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
@@ -65,7 +64,6 @@ MOMENT_MAP = "plasma"  # colour map of bending moments, by its name in matplotli
 _Pixels = Annotated[int, Limit(least=64, most=8192)]
 
 
-@dataclass(frozen=True)
 @limited(of="{} of a picture")
 class Style:
     """Colours, size and quality of a picture of a scene; what is out of range is a :class:`UsageError`."""

@@ -44,7 +44,6 @@ VIEWS: dict[str, Vector] = {
 at the animal's right side, ``front`` into its face."""
 
 
-@dataclass(frozen=True)
 @limited(of="{} of a camera")
 class Camera:
     """Viewpoint, projection and frame of a picture; what is unknown or out of range is a :class:`UsageError`."""

@@ -199,7 +199,6 @@ _UNITS = {"force": "N", "arc": "m", "moment": "N m", "base_angle": "rad", "force
 """Numbers that are found in a frame; the last two have two axes."""
 
 
-@dataclass(frozen=True)
 @limited
 class ContactOptions:
     """What is known of the traced shapes beside the whisker."""

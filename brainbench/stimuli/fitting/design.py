@@ -107,7 +107,6 @@ NOTHING = -50.0  # log D² where nothing is felt
 SOFTNESS = 0.15  # width of the soft minimum over pairs, in log D²
 
 
-@dataclass(frozen=True)
 @limited
 class DesignOptions:
     """Sensor, simulation and search of a design."""

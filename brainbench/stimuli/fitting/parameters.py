@@ -268,7 +268,6 @@ def _moved(obstacle: Obstacle, move: Mapping[str, float], start: float) -> Obsta
     return replace(move_obstacle(obstacle, shift, turn, start=start), friction=move.get("friction", obstacle.friction))
 
 
-@dataclass(frozen=True)
 @limited
 class FitOptions:
     """How a fit simulates, weighs and judges; a value outside its range is a :class:`UsageError`."""
@@ -463,7 +462,6 @@ class FreeParameters:
         return low, high
 
 
-@dataclass(frozen=True)
 @limited(of="The {} of a prior")
 class Prior:
     """What is known of a parameter before a fit."""

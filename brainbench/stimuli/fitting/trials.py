@@ -45,7 +45,6 @@ FEWEST_FRAMES = 3
 SPENT = 25.0  # decay times of the first mode after which nothing is left of a swing: e⁻²⁵
 
 
-@dataclass(frozen=True)
 @limited(of="The {} of a held whisker")
 class Pluck:
     """A whisker held aside and let go at t = 0."""

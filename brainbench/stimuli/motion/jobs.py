@@ -44,7 +44,6 @@ class Follicle(Protocol):
         ...
 
 
-@dataclass(frozen=True)
 @limited(of="The {} of a base that stands still")
 class StillFollicle:
     """A base that stands still."""
@@ -61,7 +60,6 @@ class StillFollicle:
         return np.tile(np.array(self.position, float), (count, 1)), np.tile(np.array(self.euler, float), (count, 1))
 
 
-@dataclass(frozen=True)
 @limited(of="{} of a load")
 class Load:
     """A point force on the whisker, as in a bench test; constant in world axes while it acts."""
@@ -74,8 +72,7 @@ class Load:
     """When the force vanishes [s]; it acts from the start of the job."""
 
 
-@dataclass(frozen=True, eq=False)
-@limited(of="{} of a job")
+@limited(of="{} of a job", eq=False)
 class Job:
     """One whisker to simulate from ``start``, at rest relative to its base and unbent, to the last frame."""
 

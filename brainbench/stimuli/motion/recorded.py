@@ -29,7 +29,7 @@ import logging
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 from typing import Annotated, Any, Literal
 
@@ -66,8 +66,7 @@ LAYOUTS = {
 B5) of the published sample; the average arrays have 30, the mouse E0–E5 and the rat E1–E6."""
 
 
-@dataclass(frozen=True, eq=False)
-@limited(of="{} of a trajectory")
+@limited(of="{} of a trajectory", eq=False)
 class Trajectory:
     """Angular velocities of whisker bases, evenly sampled from t = 0."""
 
@@ -157,8 +156,7 @@ class Trajectory:
         return h / 2 * (first + second) - math.sqrt(3) / 12 * h**2 * np.cross(first, second)
 
 
-@dataclass(frozen=True, eq=False)
-@limited(of="{} of recorded whisking")
+@limited(of="{} of recorded whisking", eq=False)
 class Recorded:
     """Whisking as recorded: each whisker turns from its starting orientation as its line of the file says."""
 
@@ -268,7 +266,6 @@ NEAR = 0.25  # share of the traced length, from the base, whose chord is the dir
 _AXES = ("theta", "phi", "zeta")
 
 
-@dataclass(frozen=True)
 @limited(of="{} of tracked whisking")
 class PlayOptions:
     """How tracks become motion."""
@@ -289,8 +286,7 @@ class PlayOptions:
     25 Hz. None for no filter."""
 
 
-@dataclass(frozen=True, eq=False)
-@limited(of="{} of tracked whisking")
+@limited(of="{} of tracked whisking", eq=False)
 class Tracked:
     """Whisking of one trial: each whisker turns, and its base moves, as it was tracked."""
 

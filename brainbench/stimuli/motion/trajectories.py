@@ -131,7 +131,6 @@ class Still(_Motion):
         return np.zeros((len(times), 3))
 
 
-@dataclass(frozen=True)
 @limited(of="{} of whisking")
 class Whisking(_Motion):
     """Sinusoidal whisking of the whole array about its rest pose.

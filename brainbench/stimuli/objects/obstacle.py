@@ -72,7 +72,6 @@ class _Primitive:
         return replace(self, **{name: tuple(v) if isinstance(v, list) else v for name, v in grown.items()})
 
 
-@dataclass(frozen=True)
 @limited(of="{} of a sphere")
 class Sphere(_Primitive):
     """A ball."""
@@ -127,7 +126,6 @@ class Cylinder(_Segment):
         return self.radius * np.sqrt(np.clip(1 - axis**2, 0, 1))
 
 
-@dataclass(frozen=True)
 @limited(of="{} of a box")
 class Box(_Primitive):
     """A box of half edge lengths ``half_sizes`` turned by ``quaternion`` about its centre."""
@@ -167,7 +165,6 @@ def bounds_of(parts: Iterable[Part], surface: Mesh | None) -> NDArray[np.float64
     return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
 
 
-@dataclass(frozen=True)
 @limited(of="{} of an obstacle")
 class Obstacle:
     """A rigid body made of parts that a whisker may touch.

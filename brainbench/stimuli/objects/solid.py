@@ -275,8 +275,7 @@ class _PlacedMotion:
         return self.place + moved, from_matrices(self.axes.T @ self.motion.turn(times) @ self.axes)
 
 
-@dataclass(frozen=True, eq=False)
-@limited(of="{} of an object")
+@limited(of="{} of an object", eq=False)
 class PlacedObject:
     """A solid in a scene (world frame); a friction below 0 or a pose that is not finite is a :class:`UsageError`."""
 

@@ -42,7 +42,6 @@ at its base, x-y the plane of its curvature."""
 READINGS_PER_CUTOFF = 4  # readings per period of the cut-off that a filter needs at least
 
 
-@dataclass(frozen=True)
 @limited(of="{} of the frames")
 class Frames:
     """Times at which forces are read, and the rule that makes a frame of readings.
@@ -157,7 +156,6 @@ def clip_wrenches(wrench: NDArray[np.floating], limit: float) -> tuple[NDArray[n
 WhiskerMotion = Still | Whisking | Recorded | Tracked  # motion of whiskers relative to the head
 
 
-@dataclass(frozen=True)
 @limited(of="{} of a head")
 class Head:
     """Pose of an array in the world, and its motion; one that is not finite is a :class:`UsageError`."""
@@ -189,8 +187,7 @@ class Animal:
     head: Head = field(default_factory=Head)
 
 
-@dataclass(frozen=True, eq=False)
-@limited(of="{} of a scene")
+@limited(of="{} of a scene", eq=False)
 class Scene:
     """One stimulus to simulate."""
 

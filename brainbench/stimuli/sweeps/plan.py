@@ -376,7 +376,6 @@ USUAL_SHARD = 512
 GPU_SHARD = 2048  # sweeps per shard on a GPU, which takes thousands at a time
 
 
-@dataclass(frozen=True)
 @limited
 class GenerationSettings:
     """Options of a data set of sweeps; a value outside its range is a :class:`UsageError`."""

@@ -27,7 +27,6 @@ from brainbench.stimuli.whiskers.array import WhiskerArray
 _HEAD_ONSET = 0.01  # smooth start [s] of a travelling head, whose whiskers would feel a jump of velocity as a blow
 
 
-@dataclass(frozen=True)
 @limited(of="{} of a span")
 class Span:
     """Values low, low + step, …, high, of which every draw takes one, all equally likely."""
@@ -82,7 +81,6 @@ class Sweep:
         return "_".join([f"n{self.draw}", *(f"{key}{round(values[key], 6) + 0.0:g}" for key in "hdtvs")])
 
 
-@dataclass(frozen=True)
 @limited(of="{} of a sweep grid")
 class SweepGrid:
     """A frozen set of sweep conditions; lists are combined, spans are sampled once per draw and object."""

@@ -13,7 +13,6 @@ import math
 import os
 import pickletools
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
@@ -35,7 +34,6 @@ _HEADER = b"bwhiskbin1\0\0"
 _MOST_POINTS = 100_000
 
 
-@dataclass(frozen=True)
 @limited
 class TrackOptions:
     """Scale, frame rate and identity of a track; a value that cannot be is a :class:`UsageError`."""

@@ -76,7 +76,6 @@ SOURCES = ("average", "model")
 _MM = 1e-3
 
 
-@dataclass(frozen=True)
 @limited(of="{} of a whisker")
 class MountedWhisker:
     """One whisker with its place on the face."""

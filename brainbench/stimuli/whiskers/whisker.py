@@ -32,7 +32,6 @@ _Stiffness = Annotated[float, Limit(above=0)]
 _Spring = tuple[_Stiffness, _Stiffness]
 
 
-@dataclass(frozen=True)
 @limited(of="{} of a follicle")
 class FollicleSprings:
     """What holds a follicle that gives way: a spring and a damper of each axis that is not rigid.
@@ -62,7 +61,6 @@ class FollicleSprings:
         return np.array([getattr(self, axis.name) or (0.0, 0.0) for axis in fields(self)])
 
 
-@dataclass(frozen=True)
 @limited(of="{} of a whisker", unresolved=("follicle",))
 class Whisker:
     """Geometry and material of one whisker.

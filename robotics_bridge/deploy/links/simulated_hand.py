@@ -13,7 +13,6 @@ import socket
 import time
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
@@ -40,7 +39,6 @@ HOLD_AFTER = 0.25  # seconds without a command after which the hand holds by its
 _Delay = Annotated[float, Limit(least=0, below=3600, unit="s")]
 
 
-@dataclass(frozen=True)
 @limited(of="fault '{}'")
 class Faults:
     """Faults between hand and controller. Probabilities are per report."""

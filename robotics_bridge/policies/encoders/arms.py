@@ -11,7 +11,7 @@ N picture, C channel, P = rows × columns cell, L step, B batch, I input, U unit
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, field, fields
 from functools import partial
 from typing import Annotated, Any
 
@@ -213,8 +213,7 @@ _Width = Annotated[int, Limit(least=1, most=8192)]
 Stepped = tuple[torch.Tensor, torch.Tensor]  # what a step gives, and the memory after it
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited(of="'{}' of a tactile encoder")
+@limited(of="'{}' of a tactile encoder", kw_only=True)
 class EncoderConfig:
     """A tactile encoder and what it reads; plain values only, so that it can stand in a file."""
 

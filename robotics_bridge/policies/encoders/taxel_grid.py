@@ -387,7 +387,6 @@ def _patterns(points: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[Any]]:
 _TOUCHING = 1e-3  # cells below this share of the strongest one do not count as touched
 
 
-@dataclass(frozen=True)
 @limited(of="{} of a hand calibration")
 class HandCalibration:
     """Force and moment of one site of a hand that look to the encoder as its own unit.

@@ -345,8 +345,7 @@ def read_placements(
     return placed
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited(of="{} of a probe")
+@limited(of="{} of a probe", kw_only=True)
 class ProbeOptions:
     """Extent of a probe."""
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -37,8 +37,7 @@ FELT = ("placement", "resolution", "noisy", "law", "encoder", "encoder_settings"
 _Times = Annotated[int, Limit(least=0)]
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited(of="'{}' of a student")
+@limited(of="'{}' of a student", kw_only=True)
 class DistillConfig:
     """A student, with the task's own settings for those of None (thesis, table 4.4); UsageError for a bad value."""
 

@@ -95,7 +95,6 @@ def success_of(evaluations: Sequence[Mapping[str, Any]]) -> float | None:
     return sum(episodes) / len(episodes) if episodes else None
 
 
-@dataclass(frozen=True)
 @limited(of="'{}' of a student's run")
 class StudentRun:
     """Where and how long a student is distilled, and how it is evaluated then."""
@@ -451,8 +450,7 @@ class Trainer:
         set_random_state(state["random"], self.env.device)
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited(of="'{}' of a teacher's run")
+@limited(of="'{}' of a teacher's run", kw_only=True)
 class TeacherRun:
     """Extent of a training run, and what it begins with."""
 

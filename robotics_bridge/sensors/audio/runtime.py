@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
@@ -168,7 +167,6 @@ def joint_drive(suite: SensorSuite, name: str) -> tuple[torch.Tensor, torch.Tens
     return wp.to_torch(runtime.effort)[:, window], wp.to_torch(runtime.speed)[:, window]
 
 
-@dataclass(frozen=True)
 @limited
 class Microphone:
     """A place of a listener, and the way sound takes to it."""

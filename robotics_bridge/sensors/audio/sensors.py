@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 from brainbench.core.errors import UsageError, check_number, unknown_name
@@ -16,7 +15,6 @@ from brainbench.core.limits import Count, Limit, NotNegative, Positive, limited
 from robotics_bridge.sensors.sensor import Sensor
 
 
-@dataclass(frozen=True)
 @limited
 class ElasticMaterial:
     """An isotropic solid with Rayleigh damping C = α M + β K."""
@@ -59,7 +57,6 @@ def elastic_material(name: str | ElasticMaterial) -> ElasticMaterial:
     return ELASTIC_MATERIALS[chosen]
 
 
-@dataclass(frozen=True)
 @limited(of="{} of a mode")
 class Modes:
     """Damped modes of a solid."""
@@ -99,8 +96,7 @@ def preset_modes(material: str | ElasticMaterial, lowest: float, count: int = 16
     return Modes(frequency, tuple(chosen.decay(value) for value in frequency), gain)
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited
+@limited(kw_only=True)
 class AudioSensor(Sensor):
     """A sensor that reads a block of samples [N, K] per update."""
 
@@ -116,8 +112,7 @@ class AudioSensor(Sensor):
         return self.samples
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited
+@limited(kw_only=True)
 class ContactAudio(AudioSensor):
     """Sound of a link that is struck and rubbed: [1, K] samples.
 
@@ -154,8 +149,7 @@ class ContactAudio(AudioSensor):
         return (len(self.modes.frequency) + 3) // 4
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited
+@limited(kw_only=True)
 class ActuationAudio(AudioSensor):
     """Sound of the drives of a hand: [J, K] samples, one emitter per joint.
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import os
 import struct
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import Annotated, Any
 
 from brainbench.core.devices import warp
@@ -30,8 +30,7 @@ GRID_KNOBS = TAXEL_KNOBS | {"crosstalk", "crosstalk_sigma"}
 _FORMAT = "brainbench-noise-1"
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited
+@limited(kw_only=True)
 class Noise:
     """Imperfections of one sensor; every knob is off by default."""
 

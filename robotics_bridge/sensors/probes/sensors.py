@@ -17,8 +17,7 @@ from robotics_bridge.sensors.runtime import ProbeRuntime, SuiteContext
 from robotics_bridge.sensors.sensor import QuerySensor
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited
+@limited(kw_only=True)
 class SurfaceDistanceProbe(QuerySensor):
     """Shortest signed distance [N] from each probe to the surfaces it tracks (m), negative inside.
 
@@ -42,8 +41,7 @@ class ContactDepthProbe(QuerySensor):
     runtime: ClassVar[str] = "robotics_bridge.sensors.probes.sensors:SurfaceRuntime"
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited
+@limited(kw_only=True)
 class ContactProbe(QuerySensor):
     """Contact [N] as 0 or 1, from the depth by a Schmitt trigger (thesis 4.3); noise acts on the depth."""
 

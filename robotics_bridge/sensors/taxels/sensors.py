@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, cast
 
 from brainbench.core.errors import UsageError, check_number
@@ -19,8 +19,7 @@ turns."""
 _LAW = ("stiffness", "damping", "shear", "twist", "convention", "pairs")  # settings of the law alone
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited
+@limited(kw_only=True)
 class KinematicTaxel(QuerySensor):
     """Force (N) and torque (N·m) on the sensor [N, 6], in the link frame, torques about the link's origin.
 
@@ -104,8 +103,7 @@ class KinematicTaxel(QuerySensor):
         return self.friction is not None
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited
+@limited(kw_only=True)
 class ProximityTaxel(ProbeSensor):
     """Force (N) and torque (N·m) [N, 6] from surface points within the sensing radius, link frame (thesis 4.11–4.16).
 
@@ -133,8 +131,7 @@ class ProximityTaxel(ProbeSensor):
     runtime: ClassVar[str] = "robotics_bridge.sensors.taxels.runtime:ProximityRuntime"
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited
+@limited(kw_only=True)
 class Layer:
     """Terms of a real gel pad that the published equations lack; derived in docs/elastomers.md."""
 
@@ -154,8 +151,7 @@ class Layer:
     """Half widths (m), along and across, of the clamped frame where the widening vanishes; None means free edges."""
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited
+@limited(kw_only=True)
 class ElastomerTaxel(QuerySensor):
     """Marker displacement [N, 3] in the link frame (m).
 
@@ -227,8 +223,7 @@ class ElastomerTaxel(QuerySensor):
         }
 
 
-@dataclass(frozen=True, kw_only=True)
-@limited
+@limited(kw_only=True)
 class Skin:
     """A thin elastic layer bonded to a rigid base, thin beside the contact (Johnson 1985, Contact Mechanics, 5.8).
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Annotated
 
 from brainbench.core.errors import check_name
@@ -12,7 +11,6 @@ from brainbench.core.limits import Limit, Positive, Share, limited
 ABSOLUTE_ZERO = -273.15  # [°C]
 
 
-@dataclass(frozen=True)
 @limited
 class ThermalMaterial:
     """Conduction, storage and radiation of heat in a body."""
@@ -59,7 +57,6 @@ def material(name: str | ThermalMaterial) -> ThermalMaterial:
     return MATERIALS[name]
 
 
-@dataclass(frozen=True)
 @limited
 class ThermalBody:
     """Material and temperature of a link that may be touched."""
