@@ -21,6 +21,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,7 +32,6 @@ from brainbench.core.reading.texts import parse_json
 from brainbench.datasets.sessions import SPIKES, LostColumn, Series, Session, SessionTable, decode, text
 
 if TYPE_CHECKING:
-    import h5py
     import xarray as xr
 
 FORMAT = "brainbench-recordings"
@@ -191,8 +191,6 @@ def _write_table(group: h5py.Group, table: SessionTable) -> None:
 
 def columns_of(group: h5py.Group, path: Path) -> dict[str, Any]:
     """Return the data sets of a group by name; of a dead link, a column that says so when it is asked for."""
-    import h5py
-
     columns: dict[str, Any] = {}
     for name in map(str, group):
         reason = dead_link(group, name, path)
@@ -204,8 +202,6 @@ def columns_of(group: h5py.Group, path: Path) -> dict[str, Any]:
 
 def dead_link(group: h5py.Group, name: str, path: Path) -> str | None:
     """Return one sentence about a link to what is not there; None for what is."""
-    import h5py
-
     with contextlib.suppress(KeyError, OSError):
         group[name]
         return None
@@ -222,8 +218,6 @@ def walk(
     parent: h5py.Group, path: Path, into: Callable[[str, h5py.Group], bool], place: str = ""
 ) -> Iterator[tuple[str, Any]]:
     """Yield each group by its place, down to those that ``into`` does not open, and each dead link as a lost table."""
-    import h5py
-
     for name in map(str, parent):
         here = f"{place}/{name}" if place else name
         if (reason := dead_link(parent, name, path)) is not None:
@@ -236,8 +230,6 @@ def walk(
 
 def write_array(group: h5py.Group, name: str, values: Any) -> h5py.Dataset:
     """Write numbers, compressed if they are many, or text."""
-    import h5py
-
     array = np.asarray(values)
     if array.dtype.kind in "UO":
         return group.create_dataset(name, data=array.astype(object), dtype=h5py.string_dtype())

@@ -13,8 +13,9 @@ import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import h5py
 import numpy as np
 
 from brainbench.core.contracts import as_labels
@@ -24,9 +25,6 @@ from brainbench.datasets.hdf5 import columns_of, walk, write_array
 from brainbench.datasets.sessions import SPIKES, Series, Session, SessionTable, decode, neurodata_type, text
 from brainbench.datasets.trials.counting import LICKS, OTHER_NAMES
 from brainbench.datasets.trials.selection import CONTACTS
-
-if TYPE_CHECKING:
-    import h5py
 
 STIMULI = "brainbench stimuli: "
 """Begin of ``/general/stimulus`` (NWB's notes on stimuli) where it names a recipe."""
@@ -85,8 +83,6 @@ def read_nwb(file: h5py.File, path: Path) -> Session:
 
 def _is_acquired(place: str, group: Any) -> bool:
     """Return whether a group is an acquired signal, or the licks, which are processed data with their own times."""
-    import h5py
-
     licks = place.startswith("processing/") and place.rpartition("/")[2] == LICKS
     return (licks or place.startswith("acquisition/")) and isinstance(group.get("data"), h5py.Dataset)
 
@@ -135,8 +131,6 @@ def _tables(
 
 def _with_areas(units: SessionTable, group: h5py.Group) -> SessionTable:
     """Return units with the column ``area``, where none states it: the location that all electrodes of a unit share."""
-    import h5py
-
     electrodes, rows = group.file.get("general/extracellular_ephys/electrodes"), units.data.get("electrodes")
     if not isinstance(electrodes, h5py.Group) or not isinstance(electrodes.get("location"), h5py.Dataset):
         return units
@@ -201,8 +195,6 @@ def _table(group: h5py.Group, name: str, path: Path) -> SessionTable:
 
 
 def _one_series(group: h5py.Group) -> Series:
-    import h5py
-
     path, start, rate, begin = (group.name or "").strip("/"), 0.0, math.nan, group.get("starting_time")
     if isinstance(begin, h5py.Dataset) and begin.shape == ():
         start, rate = float(begin[()]), float(begin.attrs.get("rate", math.nan))
@@ -261,8 +253,6 @@ def write_nwb(
     That it is synthetic is said in the descriptions and keywords. ``general`` and ``subject`` are further texts under
     ``/general`` and ``/general/subject``; ``columns`` says what columns mean, by name.
     """
-    import h5py
-
     if session.units is None:
         raise DataError(f"{session.source} has no units table; there are no spikes to write.")
     session.units.rows(SPIKES)  # what no reader takes is not written
@@ -303,8 +293,6 @@ def write_nwb(
 
 def _write_table(group: h5py.Group, table: SessionTable, meanings: Mapping[str, str]) -> None:
     """Write the columns of a table; ragged ones of a table without rows are left out."""
-    import h5py
-
     names = [name for name in table.columns if name not in table.index or len(table)]
     group.attrs.create("colnames", names, dtype=h5py.string_dtype())
     try:

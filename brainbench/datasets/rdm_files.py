@@ -9,8 +9,9 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,9 +21,6 @@ from brainbench.core.files import create_hdf5
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.datasets.hdf5 import as_ascii
 from brainbench.datasets.sessions import decode, text
-
-if TYPE_CHECKING:
-    import h5py
 
 LABELS, NAMES = "stimulus", "subject"  # descriptors by which we call stimuli and RDMs
 

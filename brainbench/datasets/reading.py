@@ -14,6 +14,8 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import h5py
+
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, brief, nearest, unknown_name
 from brainbench.core.plugins import load_optional
 from brainbench.core.reading.hdf5 import open_hdf5
@@ -32,8 +34,6 @@ from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.trials.selection import DEFAULT, EVERYTHING, Selection
 
 if TYPE_CHECKING:
-    import h5py
-
     from brainbench.datasets.layouts.registry import RecordingLayout
     from brainbench.datasets.sessions import Session
 

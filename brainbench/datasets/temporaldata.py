@@ -14,8 +14,9 @@ import os
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,9 +26,6 @@ from brainbench.datasets.hdf5 import as_ascii, columns_of, walk
 from brainbench.datasets.nwb import named_by_file
 from brainbench.datasets.sessions import OBSERVED, SPIKES, Series, Session, SessionTable, decode, ragged, text
 from brainbench.datasets.trials.counting import merged
-
-if TYPE_CHECKING:
-    import h5py
 
 _LOG = logging.getLogger(__name__)
 IRREGULAR, REGULAR = "IrregularTimeSeries", "RegularTimeSeries"
