@@ -11,6 +11,7 @@ NaN means "not recorded". :func:`check_stimulus_set` and :func:`check_recordings
 
 from __future__ import annotations
 
+import csv
 import math
 import os
 import re
@@ -24,6 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, check_once, listing, repeats
+from brainbench.core.reading.regular import readable
+from brainbench.core.reading.texts import read_mapping, read_text
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -313,11 +316,6 @@ def join_labels(
 
 def read_match(path: str | os.PathLike[str]) -> dict[str, str | None]:
     """Read label pairs from JSON or TOML (an object) or CSV (two columns; an empty second one drops)."""
-    import csv
-
-    from brainbench.core.reading.regular import readable
-    from brainbench.core.reading.texts import read_mapping, read_text
-
     path = Path(path)
     if not path.is_file():
         single = f"; {BY_TRIAL!r} joins the single trials of a score, and only that" if str(path) == BY_TRIAL else ""

@@ -11,6 +11,7 @@ import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache, cached_property
+from html import escape
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, get_args
 
 import msgspec
@@ -305,8 +306,6 @@ class Score(NullIsNaN, _Document):
 
     def _repr_html_(self) -> str:
         """Show the score as a small table in a notebook."""
-        from html import escape
-
         ceiling = f"{spanned(self.ceiling.lower)} to {spanned(self.ceiling.upper)}" if self.ceiling else "none"
         rows = [
             ("score, from chance (0) to all that is reliable (1)", spanned(self.scaled, self.scaled_interval)),

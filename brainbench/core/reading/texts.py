@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -39,8 +40,6 @@ def parse_json(text: str, name: str) -> Any:
 
 def parse_toml(text: str, name: str) -> dict[str, Any]:
     """Parse TOML text; ``name`` is that of its file in messages. Errors are those of :func:`parse_json`."""
-    import tomllib
-
     with readable(name, "TOML text"):
         return check_values(tomllib.loads(text), name)
 
