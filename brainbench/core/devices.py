@@ -18,10 +18,13 @@ import numpy as np
 
 from brainbench.core.errors import UsageError, brief
 from brainbench.core.files import cache_dir, check_folder, user_folder
+from brainbench.core.lazy import LazyModule
 from brainbench.core.reading.regular import temporary_folder
 
 if TYPE_CHECKING:
     import torch
+else:
+    torch = LazyModule("torch")
 
 _STARTING = threading.Lock()
 
@@ -114,8 +117,6 @@ def gpus() -> list[str]:
 
 def torch_device(name: Any) -> torch.device:
     """Return the torch device called ``cpu``, ``cuda`` or ``cuda:1``; a torch device passes through."""
-    import torch
-
     try:
         device = torch.device(name)
     except (RuntimeError, TypeError) as error:
@@ -166,8 +167,6 @@ recorded with, and the tensors that replays fill."""
 
 def record_torch(work: Callable[[], Any]) -> tuple[torch.cuda.CUDAGraph, Any]:
     """Record torch's work; a :data:`Recorder`."""
-    import torch
-
     graph = torch.cuda.CUDAGraph()
     # Other threads may work on the same device meanwhile.
     with torch.cuda.graph(graph, capture_error_mode="thread_local"):
@@ -248,8 +247,6 @@ class CudaGraphStep:
 
     def _release_generators(self, states: Sequence[torch.Tensor]) -> None:
         """Take generators out of the recording that broke off: one that ends well does."""
-        import torch
-
         if not self._generators:
             return
         try:
@@ -287,8 +284,6 @@ def record_launches(work: Callable[[], None], device: Any) -> Callable[[], None]
 @contextlib.contextmanager
 def side_stream(device: torch.device | None = None) -> Iterator[torch.cuda.Stream]:
     """Work on a new stream of torch, after all that was asked for before and before all that is asked for later."""
-    import torch
-
     side = torch.cuda.Stream(device)
     side.wait_stream(torch.cuda.current_stream(device))
     with torch.cuda.stream(side):

@@ -1,4 +1,4 @@
-"""Public names of a package that are imported on first use, so that importing the package stays quick."""
+"""What is imported on first use, so that importing a package stays quick: its public names, and slow modules."""
 
 from __future__ import annotations
 
@@ -8,6 +8,24 @@ from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
+
+
+class LazyModule:
+    """Stands for a module that is slow to import and that a module needs in some of its functions alone.
+
+    Type checkers read the import itself::
+
+        if TYPE_CHECKING:
+            import torch
+        else:
+            torch = LazyModule("torch")
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __getattr__(self, attribute: str) -> Any:
+        return getattr(sys.modules.get(self._name) or import_module(self._name), attribute)
 
 
 def lazy_exports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:

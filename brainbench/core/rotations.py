@@ -13,11 +13,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
+from brainbench.core.lazy import LazyModule
 from brainbench.core.limits import Limit
 
 if TYPE_CHECKING:
     import torch
     from numpy.typing import ArrayLike, NDArray
+else:
+    torch = LazyModule("torch")
 
 TURN = 2 * math.pi  # a full turn [rad]: poses with larger angles are taken for degrees and refused
 
@@ -99,16 +102,12 @@ def constant(values: float | Sequence[float], like: torch.Tensor) -> torch.Tenso
 
 @cache
 def _constant(values: Any, device: torch.device, dtype: torch.dtype) -> torch.Tensor:
-    import torch
-
     with torch.inference_mode(False):
         return torch.tensor(values, device=device, dtype=dtype)
 
 
 def multiply(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Return the quaternions [..., 4] of turning by b first, then by a."""
-    import torch
-
     aw, ax, ay, az = a.unbind(-1)
     bw, bx, by, bz = b.unbind(-1)
     return torch.stack(
@@ -124,22 +123,16 @@ def multiply(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 def conjugate(q: torch.Tensor) -> torch.Tensor:
     """Return the inverse turns [..., 4] of unit quaternions."""
-    import torch
-
     return torch.cat((q[..., :1], -q[..., 1:]), dim=-1)
 
 
 def from_xyzw(q: torch.Tensor) -> torch.Tensor:
     """Return quaternions (x, y, z, w) [..., 4] as (w, x, y, z)."""
-    import torch
-
     return torch.cat((q[..., 3:], q[..., :3]), dim=-1)
 
 
 def rotate(q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
     """Return vectors [..., 3] turned by unit quaternions [..., 4]."""
-    import torch
-
     u, w = q[..., 1:], q[..., :1]
     v = v.expand(u.shape)
     t = 2 * torch.linalg.cross(u, v)
@@ -148,16 +141,12 @@ def rotate(q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
 
 def about(axis: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
     """Return the quaternions [..., 4] of turns by angles [...] (rad) about unit axes [..., 3]."""
-    import torch
-
     half = 0.5 * angle.unsqueeze(-1)
     return torch.cat((torch.cos(half), torch.sin(half) * axis), dim=-1)
 
 
 def angle_of(q: torch.Tensor) -> torch.Tensor:
     """Return the angle [...] (rad, 0 to pi) by which unit quaternions turn."""
-    import torch
-
     return 2 * torch.atan2(q[..., 1:].norm(dim=-1), q[..., 0].abs())
 
 
@@ -166,8 +155,6 @@ def twist_and_swing(q: torch.Tensor, axis: torch.Tensor) -> tuple[torch.Tensor, 
 
     A turn is its twist about the axis followed by a swing about an axis perpendicular to it.
     """
-    import torch
-
     along = (q[..., 1:] * axis).sum(dim=-1)
     twist = 2 * torch.atan2(along, q[..., 0])
     twist = torch.remainder(twist + torch.pi, 2 * torch.pi) - torch.pi
@@ -180,8 +167,6 @@ def twist_of(q: torch.Tensor, axis: torch.Tensor) -> torch.Tensor:
 
     Without it a turn is the smallest that differs from the whole by a turn about that axis.
     """
-    import torch
-
     along = (q[..., 1:] * axis).sum(dim=-1, keepdim=True)
     twist = torch.cat((q[..., :1], along * axis), dim=-1)
     length = twist.norm(dim=-1, keepdim=True)
@@ -192,8 +177,6 @@ def twist_of(q: torch.Tensor, axis: torch.Tensor) -> torch.Tensor:
 
 def six_numbers(q: torch.Tensor) -> torch.Tensor:
     """Return the first two columns of the rotation matrices as [..., 6] (Zhou et al. 2019)."""
-    import torch
-
     x, y = constant((1.0, 0.0, 0.0), q), constant((0.0, 1.0, 0.0), q)
     return torch.cat((rotate(q, x), rotate(q, y)), dim=-1)
 

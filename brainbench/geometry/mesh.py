@@ -20,10 +20,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import DataError, UsageError, brief, check_name, check_number, unknown_name
 from brainbench.core.files import atomic_path, content_hash, without_last_digits
+from brainbench.core.lazy import LazyModule
 from brainbench.core.reading.regular import MOST_PART, check_file, part_of, readable
 
 if TYPE_CHECKING:
     import trimesh
+else:
+    trimesh = LazyModule("trimesh")
 
 MERGE = 1e-6  # vertices of an open mesh that lie closer than this part of its diagonal are taken for one
 CRACK = 1e-3  # largest part of the surface that a triangle closing a crack may have
@@ -89,7 +92,6 @@ def _drop(mesh: Mesh, done: list[str]) -> Mesh:
 
 def _close(mesh: Mesh, done: list[str]) -> Mesh:
     """Merge nearly equal vertices and close small cracks, if that leaves fewer open edges."""
-    import trimesh
     from scipy.spatial import KDTree
 
     # Neighbours by tree in V log V; chains of near vertices become one by connected components.
@@ -120,8 +122,6 @@ def _close(mesh: Mesh, done: list[str]) -> Mesh:
 
 
 def _agree(mesh: Mesh, done: list[str]) -> Mesh:
-    import trimesh
-
     solid = mesh.to_trimesh()
     trimesh.repair.fix_winding(solid)
     fixed = Mesh(mesh.vertices, np.asarray(solid.faces), mesh.name)
@@ -333,8 +333,6 @@ class Mesh:
 
     def to_trimesh(self) -> trimesh.Trimesh:
         """Return a :class:`trimesh.Trimesh` with the same vertices and faces."""
-        import trimesh
-
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
 
@@ -388,8 +386,6 @@ def load_mesh(path: str | os.PathLike[str], *, unit: str, apart: bool = False) -
     formats carry none). With ``apart``, closed bodies that touch keep vertices of their own, so that
     :meth:`Mesh.pieces` tells them apart.
     """
-    import trimesh
-
     check_name("length unit", unit, UNITS)
     path = check_file(path, "mesh file", most=MOST_PART)
     with readable(path, "mesh"):
@@ -428,8 +424,6 @@ class _Beside:
 
 def _scene(path: Path, **options: Any) -> Any:
     """Read a file by trimesh; indices of an OBJ that count back from their line are made absolute first."""
-    import trimesh
-
     options["resolver"] = _Beside(path.parent)
     if path.suffix.lower() == ".obj":
         text = path.read_text(errors="replace")
@@ -462,8 +456,6 @@ def _absolute(text: str) -> str:
 
 def _bodies(path: Path) -> Mesh | None:
     """Return a file's bodies with vertices of their own, if its indices, or else its objects, make closed ones."""
-    import trimesh
-
     scene = _scene(path, **({"split_objects": True} if path.suffix.lower() == ".obj" else {}))
     parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
     joined: Any = trimesh.util.concatenate(parts)

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.core.errors import BrainbenchError, UsageError, check_each, check_number, listing, unknown_name
+from brainbench.core.lazy import LazyModule
 from brainbench.core.plugins import load_optional, optional_parts
 from brainbench.core.reading.regular import temporary_folder
 
@@ -28,7 +29,11 @@ if TYPE_CHECKING:
     import torch
     from torch import nn
 
+    from brainbench.models import proof
     from brainbench.models.proof import Layout
+else:
+    torch = LazyModule("torch")
+    proof = LazyModule("brainbench.models.proof")
 
 _log = logging.getLogger(__name__)
 
@@ -123,9 +128,6 @@ def extract(
             time.
         memory: Layers beyond this many GiB lie in temporary files, which go with the result.
     """
-    import torch
-
-    from brainbench.models import proof
     from brainbench.models.ops.layers import check_weights
 
     given = getattr(stimuli, "input", stimuli)
@@ -212,8 +214,6 @@ def evaluating(model: nn.Module) -> Iterator[None]:
 @contextmanager
 def _surroundings(model: nn.Module) -> Iterator[Any]:
     """Keep the caller's autocast, inference mode, default device (yielded) and default precision out of a reading."""
-    import torch
-
     where, kind = torch.get_default_device(), torch.get_default_dtype()
     double = any(weight.dtype == torch.float64 for weight in model.parameters())
     with ExitStack() as scope:
@@ -234,10 +234,6 @@ class _Run:
     """A model and its stimuli, of which it gets copies."""
 
     def __init__(self, model: nn.Module, values: Any, device: Any) -> None:
-        import torch
-
-        from brainbench.models import proof
-
         self.model, self.values, self.device = model, values, device
         self.count, self.steps = values.shape[:2]
         self.like = next((p for p in model.parameters() if p.is_floating_point()), torch.zeros(()))
@@ -247,8 +243,6 @@ class _Run:
 
     def stimuli(self, rows: slice | np.ndarray) -> torch.Tensor:
         """Return a copy of stimuli, which a model may write to."""
-        import torch
-
         if isinstance(self.values, torch.Tensor):
             part = self.values[torch.as_tensor(rows) if isinstance(rows, np.ndarray) else rows].detach().clone()
         else:
@@ -257,8 +251,6 @@ class _Run:
 
     def __call__(self, reader: Callable[[torch.Tensor], Any], part: torch.Tensor) -> Any:
         """Run a model or a reader of it on stimuli; what fails is told in one sentence."""
-        import torch
-
         version = part._version
         try:
             # A model on a GPU may rely on the program's default device for the states that it makes.
@@ -307,8 +299,6 @@ class _Sketches:
 
     def add(self, run: int, key: tuple[str, int | None], rows: torch.Tensor, stimuli: Iterable[int]) -> None:
         """Keep the sketches of the rows that are of sampled stimuli."""
-        from brainbench.models import proof
-
         pairs = [(row, place) for row, stimulus in enumerate(stimuli) for place in self.places.get(int(stimulus), ())]
         if pairs:
             source, target = map(list, zip(*pairs, strict=True))
@@ -323,8 +313,6 @@ class _Sketches:
 
     def unequal(self) -> dict[str, str]:
         """Return the layers that the runs do not agree on, with the reason."""
-        from brainbench.models import proof
-
         reasons: dict[str, str] = {}
         for key, before in self.runs[0].items():
             after = self.runs[1].get(key)
@@ -410,15 +398,11 @@ class _Rooms:
 
 def _plain(rows: torch.Tensor) -> np.ndarray:
     """Return rows as single precision in memory."""
-    import torch
-
     return rows.detach().to("cpu", dtype=torch.float32).numpy()
 
 
 def _read_proven(run: _Run, read: Any, rooms: _Rooms, chunk: int) -> None:
     """Read layers [B, T, …] that need no proof."""
-    import torch
-
     for place in run.chunks(chunk):
         for name, activity in run(read, run.stimuli(place)).items():
             rooms.order.setdefault(name, len(rooms.order))
@@ -441,10 +425,6 @@ class _ForeignReader:
     """Reads a network of others: proves what its parts return, or what it names, on a copy of it, then runs it once."""
 
     def __init__(self, run: _Run, layers: Collection[str] | None, rooms: _Rooms) -> None:
-        import torch
-
-        from brainbench.models import proof
-
         self.run, self.rooms, self.layers = run, rooms, layers
         self.named = named_reader(run.model, layers) is not None
         self.modules = self._modules(run.model)
@@ -461,8 +441,6 @@ class _ForeignReader:
         self.fill = 1  # stimuli that a batch has at least; more where a model takes no others
 
     def _modules(self, model: nn.Module) -> dict[str, nn.Module]:
-        from brainbench.models import proof
-
         choices = _choices(model)
         if self.layers is None:
             return choices if self.named else {**proof.layer_modules(model), OUTPUT: model}
@@ -504,8 +482,6 @@ class _ForeignReader:
 
     def _forward(self, model: nn.Module, part: torch.Tensor, take: Callable[[str, int, Any], None]) -> dict[str, int]:
         """Run a model, give each call's first tensor away, and return how often each module was called."""
-        from brainbench.models import proof
-
         counts: dict[str, int] = {}
 
         def count(name: str, output: Any) -> None:
@@ -532,10 +508,6 @@ class _ForeignReader:
 
     def _prove(self) -> _Sketches:
         """Find the places of stimuli and time in what each module returns; the second batch holds sampled stimuli."""
-        import torch
-
-        from brainbench.models import proof
-
         run, model = self.run, self.fresh or self.run.model
         stimuli = run.stimuli(run.sample[:16])
         rows = proof.probes(stimuli.cpu(), run.steps)
@@ -585,8 +557,6 @@ class _ForeignReader:
 
     def _place(self, name: str, tensors: list[Any], proven: list[Any], batch: int) -> None:
         """Decide which layers, and which steps of them, the calls of a module are."""
-        from brainbench.models import proof
-
         if len(tensors) > 1 and (loop := self._loop(tensors, proven, batch)) is not None:
             layout, before, after = loop
             for index, tensor in enumerate(tensors):
@@ -610,10 +580,6 @@ class _ForeignReader:
 
     def _loop(self, tensors: list[Any], proven: list[Any], batch: int) -> tuple[Layout, int, int] | None:
         """Return the layout of calls that are the steps of a loop, and how many calls stand around its steps."""
-        import torch
-
-        from brainbench.models import proof
-
         steps, count = self.run.steps, len(tensors)
         if steps < 2 or count % steps or len({getattr(tensor, "shape", None) for tensor in tensors}) != 1:
             return None
@@ -648,8 +614,6 @@ class _ForeignReader:
 
     def _run_all(self, chunk: int, sketches: _Sketches) -> None:
         """Run all stimuli once, and write what is a response."""
-        from brainbench.models import proof
-
         rooms, run = self.rooms, self.run
         firsts: dict[tuple[str, int], torch.Tensor] = {}
         moved: set[tuple[str, int]] = set()

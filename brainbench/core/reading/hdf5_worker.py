@@ -15,7 +15,16 @@ import shutil
 import signal
 import stat
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.lazy import LazyModule
+
+if TYPE_CHECKING:
+    import h5py
+else:
+    h5py = LazyModule("h5py")
 
 MOST_MEMORY = 2 << 30  # bytes that an array may take beyond MOST_EXPANSION times what is stored of it
 MOST_EXPANSION = 200  # bytes of an array for each stored one; recordings reach about 20, a decompression bomb 1000
@@ -40,8 +49,6 @@ def fault_of(path: str, folders: list[str] | tuple[str, ...] = (), copy: str = "
         folders: other folders than its own that its links may lead into.
         copy: where to write the copy of a file that links to others.
     """
-    import h5py
-
     try:
         before = os.stat(path)  # noqa: PTH116 - its fields are compared
         with h5py.File(path, "r") as file:
@@ -100,8 +107,6 @@ def _attributes(node: Any, name: str) -> None:
 
 def _names_axes(attribute: Any, key: str) -> bool:
     """Return False for a list of axes of another type: the library writes past its memory when it follows one."""
-    import h5py
-
     kind = attribute.attrs.get_id(key).dtype
     if key == "DIMENSION_LIST":
         held = h5py.check_vlen_dtype(kind)
@@ -149,16 +154,12 @@ class _Copy:
 
     def write(self, file: Any, copy: str) -> None:
         """Write the copy of an open file."""
-        import h5py
-
         shutil.copyfile(file.filename, copy)
         Path(copy).chmod(0o600)
         with h5py.File(copy, "r+") as target:
             self._group(file, target)
 
     def _group(self, source: Any, target: Any) -> None:
-        import h5py
-
         self.seen.add(_key(source))
         for name in source:
             link, node = source.get(name, getlink=True), None
@@ -189,8 +190,6 @@ class _Copy:
 
     def _follow(self, group: Any, path: str, hops: int = 0) -> Any:
         """Return what a path leads to, through links of all kinds."""
-        import h5py
-
         if hops > MOST_HOPS:
             raise Refused(f"has links that lead to themselves or over more than {MOST_HOPS} others ({path[:80]!r})")
         node: Any = group.file["/"] if path.startswith("/") else group
@@ -211,8 +210,6 @@ class _Copy:
 
     def _open(self, file: Any, name: str) -> Any:
         """Open a file that another names."""
-        import h5py
-
         place = self._place(file, name, self.folders)
         if place not in self.files:
             self.files[place] = h5py.File(place, "r")
@@ -238,9 +235,6 @@ class _Copy:
 
     def _values(self, node: Any, route: tuple[Any, ...] = ()) -> Any:
         """Read an array; one of parts of others is put together here."""
-        import h5py
-        import numpy as np
-
         if node.shape is None or not (node.is_virtual or node.external):
             return node[()]
         if node.external:
@@ -267,8 +261,6 @@ class _Copy:
 
     def _raw(self, node: Any) -> Any:
         """Read an array that lies in the bytes of other files: only in folders that were allowed by name."""
-        import numpy as np
-
         data = b""
         for name, offset, size in node.external:
             place = self._place(node.file, os.fsdecode(name), self.allowed)
@@ -290,7 +282,6 @@ def _key(node: Any) -> tuple[int, int]:
 
 def _selected(space: Any, shape: tuple[int, ...]) -> Any:
     """Return the values [shape] that a selection holds, true for each; None where it reaches beyond the array."""
-    import numpy as np
     from h5py import h5s  # pyright: ignore[reportAttributeAccessIssue] - compiled
 
     kind, mask = space.get_select_type(), np.zeros(shape, bool)

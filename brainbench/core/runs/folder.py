@@ -18,12 +18,15 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from brainbench.core.errors import DataError, UsageError, brief, check_number
 from brainbench.core.files import is_temporary, lock_folder, read_mapping, to_plain, write_json, write_tensors
+from brainbench.core.lazy import LazyModule
 from brainbench.core.reading.regular import check_file, readable, reason
 from brainbench.core.reading.tensors import check_finite
 
 if TYPE_CHECKING:
     import torch
     from torch import nn
+else:
+    torch = LazyModule("torch")
 
 RUN, CONFIG = "run.json", "config.json"
 RESTART = "Delete it to start anew."
@@ -112,8 +115,6 @@ _LEAF = "__tensor__"
 
 def flatten(tree: Any, prefix: str = "") -> tuple[dict[str, torch.Tensor], Any]:
     """Split a tree into named tensors and a JSON-able rest."""
-    import torch
-
     tensors: dict[str, torch.Tensor] = {}
     if isinstance(tree, torch.Tensor):
         return {prefix: tree}, {_LEAF: prefix}
@@ -172,8 +173,6 @@ def load_state(path: str | os.PathLike[str]) -> Any:
 
 def random_state(device: torch.device) -> dict[str, torch.Tensor]:
     """Return the states of PyTorch's random numbers on the CPU and on a device."""
-    import torch
-
     states = {"cpu": torch.get_rng_state()}
     if device.type == "cuda":
         states["cuda"] = torch.cuda.get_rng_state(device)
@@ -182,8 +181,6 @@ def random_state(device: torch.device) -> dict[str, torch.Tensor]:
 
 def set_random_state(states: Mapping[str, torch.Tensor], device: torch.device) -> None:
     """Put random numbers back where :func:`random_state` found them."""
-    import torch
-
     torch.set_rng_state(states["cpu"])
     if device.type == "cuda" and "cuda" in states:
         torch.cuda.set_rng_state(states["cuda"], device)

@@ -32,6 +32,7 @@ from brainbench.core.errors import (
     listing,
 )
 from brainbench.core.files import cache_dir, content_hash, hash_arrays, read_json
+from brainbench.core.lazy import LazyModule
 from brainbench.core.limits import Count, Seed, limited
 from brainbench.core.plugins import load_optional
 from brainbench.core.progress import Progress, track
@@ -42,6 +43,8 @@ from brainbench.core.reading.sealed import is_sealed, keep_entry, read_sealed, w
 if TYPE_CHECKING:
     import torch
     from numpy.typing import NDArray
+else:
+    torch = LazyModule("torch")
 
 FOLDERS = {"train": "train", "validate": "validation", "validation": "validation", "val": "validation", "test": "test"}
 """Folders of the published study's sweeps → split."""
@@ -423,8 +426,6 @@ class WhiskingDataset:
 
     def batch(self, sweeps: Sequence[int] | NDArray[np.integer]) -> Batch:
         """Return chosen sweeps, numbers from 0 to N − 1, as a batch on the device."""
-        import torch
-
         sweeps = np.asarray(sweeps)
         device = torch.device(self.device)
         shape = (len(sweeps), *self._shards[0].shape)
@@ -508,8 +509,6 @@ class WhiskingDataset:
     @cached_property
     def _columns(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Places of the numbers of a frame's grid [C·H·W] in the frame [W·C], and the cells without a whisker."""
-        import torch
-
         cells, size = self._shards[0].cells, GRID_SHAPE[0] * GRID_SHAPE[1]
         source = np.zeros((len(CHANNELS), size), dtype=np.int64)
         source[:, cells] = np.arange(len(cells)) * len(CHANNELS) + np.arange(len(CHANNELS))[:, None]
@@ -518,8 +517,6 @@ class WhiskingDataset:
 
     def _to_grid(self, raw: torch.Tensor) -> torch.Tensor:
         """Return [B, T, S·C, H, W] of [B, frame, W, C]: sub-step major, cells without a whisker zero."""
-        import torch
-
         source, empty = self._columns
         count, frames = raw.shape[:2]
         rows = raw.view(count * frames, -1)
