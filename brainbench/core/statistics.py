@@ -10,7 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import DataError, UsageError, check_number
+from brainbench.core.lazy import LazyModule
 from brainbench.core.records import Interval, Score
+
+special = LazyModule("scipy.special")
 
 LEVEL = 0.95  # confidence level of all intervals
 
@@ -23,12 +26,10 @@ def t_interval(values: ArrayLike, *, over: str = "values") -> Interval | None:
         over: What the values are, for the method's name: ``animals``, ``seeds``.
     """
     # scipy.stats has the same quantile, but takes most of a second to import.
-    from scipy.special import stdtrit
-
     array = np.asarray(values, dtype=np.float64)
     if len(array) < 2 or not np.isfinite(array).all():
         return None
-    half = float(stdtrit(len(array) - 1, (1 + LEVEL) / 2) * array.std(ddof=1) / math.sqrt(len(array)))
+    half = float(special.stdtrit(len(array) - 1, (1 + LEVEL) / 2) * array.std(ddof=1) / math.sqrt(len(array)))
     mean = float(array.mean())
     return Interval(mean - half, mean + half, LEVEL, f"t over {len(array)} {over}")
 
@@ -77,13 +78,11 @@ def two_factor_interval(
 
     ``animals`` [A] are the values of single animals, ``without_stimulus`` [K] the mean without each stimulus in turn.
     """
-    from scipy.special import stdtrit
-
     check_level(level)
     error, freedom = (float(found) for found in two_factor_error(animals, without_stimulus))
     if not math.isfinite(error):
         return None
-    half = float(stdtrit(freedom, (1 + level) / 2)) * error if error > 0 else 0.0
+    half = float(special.stdtrit(freedom, (1 + level) / 2)) * error if error > 0 else 0.0
     count, stimuli = (np.isfinite(np.asarray(part, dtype=np.float64)).sum() for part in (animals, without_stimulus))
     what = f"t over {count} animals and {stimuli} stimuli (jackknife)"
     return Interval(value - half, value + half, level, what)
@@ -99,14 +98,12 @@ def _spread(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def wilson_interval(successes: float, count: int, *, over: str = "trials", level: float = LEVEL) -> Interval:
     """Return Wilson's score interval of a proportion of independent trials (Wilson 1927)."""
-    from scipy.special import ndtri
-
     if count < 1:
         raise DataError("A proportion needs at least one observation.")
     # A share times a count may lie beyond by its last digit.
     if not -1e-9 <= successes <= count + 1e-9:
         raise UsageError(f"Of {count:,} observations {successes} cannot be successes.")
-    z = float(ndtri(0.5 + level / 2))
+    z = float(special.ndtri(0.5 + level / 2))
     share = min(max(successes / count, 0.0), 1.0)
     middle = (share + z * z / (2 * count)) / (1 + z * z / count)
     half = z / (1 + z * z / count) * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))
@@ -146,7 +143,6 @@ def presentation_order(times: ArrayLike, labels: ArrayLike) -> PresentationOrder
     >>> presentation_order([1, 2, 3, 4, 5, 6, 7, 8, 9], list("aaabbbccc")).share
     0.9
     """
-    from scipy.special import fdtrc
     from scipy.stats import rankdata
 
     names, codes = np.unique(np.asarray(labels), return_inverse=True)
@@ -159,7 +155,7 @@ def presentation_order(times: ArrayLike, labels: ArrayLike) -> PresentationOrder
     ranks = ranks - ranks.mean()
     share = float((np.bincount(codes, weights=ranks) ** 2 / counts).sum() / (ranks**2).sum())
     between, within = len(names) - 1, len(order) - len(names)
-    p = float(fdtrc(between, within, share / max(1 - share, 1e-300) * within / between))
+    p = float(special.fdtrc(between, within, share / max(1 - share, 1e-300) * within / between))
     return PresentationOrder(share, between / (between + within), p)
 
 
@@ -203,8 +199,6 @@ def compare_scores(first: Score, second: Score) -> PairTest:
 
     Fewer than :data:`FEWEST_ANIMALS` animals or :data:`FEWEST_STIMULI` stimuli give no p.
     """
-    from scipy.special import stdtr
-
     animals, without = paired_differences(first, second)
     names = first.name, second.name
     if len(animals) < 2:
@@ -218,7 +212,7 @@ def compare_scores(first: Score, second: Score) -> PairTest:
         return PairTest(*names, difference, interval, math.nan, math.nan, why)
     error, freedom = two_factor_error(animals, without)
     # Without spread the t statistic is infinite, or there is no difference.
-    p = 2 * float(stdtr(freedom, -abs(difference) / float(error))) if error > 0 else float(difference == 0)
+    p = 2 * float(special.stdtr(freedom, -abs(difference) / float(error))) if error > 0 else float(difference == 0)
     return PairTest(*names, difference, interval, p, math.nan)
 
 

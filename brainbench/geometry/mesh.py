@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 else:
     trimesh = LazyModule("trimesh")
 
+spatial = LazyModule("scipy.spatial")
+
 MERGE = 1e-6  # vertices of an open mesh that lie closer than this part of its diagonal are taken for one
 CRACK = 1e-3  # largest part of the surface that a triangle closing a crack may have
 
@@ -92,10 +94,8 @@ def _drop(mesh: Mesh, done: list[str]) -> Mesh:
 
 def _close(mesh: Mesh, done: list[str]) -> Mesh:
     """Merge nearly equal vertices and close small cracks, if that leaves fewer open edges."""
-    from scipy.spatial import KDTree
-
     # Neighbours by tree in V log V; chains of near vertices become one by connected components.
-    pairs = KDTree(mesh.vertices).query_pairs(MERGE * mesh.diagonal, output_type="ndarray")
+    pairs = spatial.KDTree(mesh.vertices).query_pairs(MERGE * mesh.diagonal, output_type="ndarray")
     if len(pairs):
         group = trimesh.graph.connected_component_labels(pairs, node_count=len(mesh.vertices))
         representative = np.unique(group, return_index=True)[1]
@@ -348,9 +348,7 @@ def convex_hull(points: NDArray[np.float64], name: str = "mesh") -> Mesh:
 
 def hull_faces(points: NDArray[np.float64]) -> NDArray[np.int32]:
     """Return the outward faces [F, 3] of the convex hull of points [n, 3], as indices of these."""
-    from scipy.spatial import ConvexHull
-
-    hull = ConvexHull(points)
+    hull = spatial.ConvexHull(points)
     faces = np.array(hull.simplices)
     # Qhull orders the corners of a facet as it likes; its equations know the way out.
     first, second, third = (points[faces[:, corner]] for corner in range(3))
@@ -568,12 +566,10 @@ class _Surface:
     """Distances to a surface: near samples choose candidate triangles, whose distance is exact."""
 
     def __init__(self, mesh: Mesh, rng: np.random.Generator) -> None:
-        from scipy.spatial import KDTree
-
         self._triangles = mesh.vertices[mesh.faces]
         points, owner = sample_surface(mesh, _SPOTS, rng)
         # Centres as well, so that no small triangle is out of every list.
-        self._tree = KDTree(np.concatenate([points, self._triangles.mean(axis=1)]))
+        self._tree = spatial.KDTree(np.concatenate([points, self._triangles.mean(axis=1)]))
         self._owner = np.concatenate([owner, np.arange(len(mesh.faces))])
 
     def distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
