@@ -18,13 +18,13 @@ import numpy as np
 
 from brainbench.core.errors import UsageError, brief
 from brainbench.core.files import cache_dir, check_folder, user_folder
-from brainbench.core.lazy import LazyModule
+from brainbench.core.lazy import lazy_module
 from brainbench.core.reading.regular import temporary_folder
 
 if TYPE_CHECKING:
     import torch
 else:
-    torch = LazyModule("torch")
+    torch = lazy_module("torch")
 
 _STARTING = threading.Lock()
 

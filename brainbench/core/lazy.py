@@ -1,4 +1,4 @@
-"""What is imported on first use, so that importing a package stays quick: its public names, and slow modules."""
+"""Public names of a package, and modules, that are imported on first use, so that importing a package stays quick."""
 
 from __future__ import annotations
 
@@ -7,25 +7,20 @@ from collections.abc import Callable
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
+from types import ModuleType
 from typing import Any
 
 
-class LazyModule:
-    """Stands for a module that is slow to import and that a module needs in some of its functions alone.
+class _Stand(ModuleType):
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(import_module(self.__name__), name)
+        setattr(self, name, value)
+        return value
 
-    Type checkers read the import itself::
 
-        if TYPE_CHECKING:
-            import torch
-        else:
-            torch = LazyModule("torch")
-    """
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-
-    def __getattr__(self, attribute: str) -> Any:
-        return getattr(sys.modules.get(self._name) or import_module(self._name), attribute)
+def lazy_module(name: str) -> Any:
+    """Return a stand-in for a module that is slow to import: it is imported when something of it is first asked for."""
+    return _Stand(name)
 
 
 def lazy_exports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:

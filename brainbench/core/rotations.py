@@ -13,16 +13,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from brainbench.core.lazy import LazyModule
+from brainbench.core.lazy import lazy_module
 from brainbench.core.limits import Limit
 
 if TYPE_CHECKING:
     import torch
     from numpy.typing import ArrayLike, NDArray
 else:
-    torch = LazyModule("torch")
-
-transform = LazyModule("scipy.spatial.transform")
+    torch = lazy_module("torch")
 
 TURN = 2 * math.pi  # a full turn [rad]: poses with larger angles are taken for degrees and refused
 
@@ -36,22 +34,26 @@ Angles = tuple[Angle, Angle, Angle]
 
 def to_matrices(quaternions: ArrayLike) -> NDArray[np.float64]:
     """Return the rotation matrices [..., 3, 3] of unit quaternions [..., 4]."""
+    from scipy.spatial.transform import Rotation
+
     q = np.asarray(quaternions, dtype=np.float64)
-    return transform.Rotation.from_quat(np.roll(q, -1, axis=-1).reshape(-1, 4)).as_matrix().reshape(*q.shape[:-1], 3, 3)
+    return Rotation.from_quat(np.roll(q, -1, axis=-1).reshape(-1, 4)).as_matrix().reshape(*q.shape[:-1], 3, 3)
 
 
 def from_matrices(matrices: ArrayLike) -> NDArray[np.float64]:
     """Return the unit quaternions [..., 4] of rotation matrices [..., 3, 3]."""
+    from scipy.spatial.transform import Rotation
+
     m = np.asarray(matrices, dtype=np.float64)
-    return np.roll(transform.Rotation.from_matrix(m.reshape(-1, 3, 3)).as_quat(), 1, axis=-1).reshape(*m.shape[:-2], 4)
+    return np.roll(Rotation.from_matrix(m.reshape(-1, 3, 3)).as_quat(), 1, axis=-1).reshape(*m.shape[:-2], 4)
 
 
 def from_rpy(angles: ArrayLike) -> NDArray[np.float64]:
     """Return the unit quaternions [..., 4] of turns about fixed x, y, z by angles [..., 3] (rad), as in URDF."""
+    from scipy.spatial.transform import Rotation
+
     a = np.asarray(angles, dtype=np.float64)
-    return np.roll(transform.Rotation.from_euler("xyz", a.reshape(-1, 3)).as_quat(), 1, axis=-1).reshape(
-        *a.shape[:-1], 4
-    )
+    return np.roll(Rotation.from_euler("xyz", a.reshape(-1, 3)).as_quat(), 1, axis=-1).reshape(*a.shape[:-1], 4)
 
 
 def euler_matrix(angles: ArrayLike) -> NDArray[np.float64]:

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TypeGuard
+from typing import TYPE_CHECKING, TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import DataError, UsageError, check_number
-from brainbench.core.lazy import LazyModule
+from brainbench.core.lazy import lazy_module
 from brainbench.core.records import Interval, Score
 
-special = LazyModule("scipy.special")
+if TYPE_CHECKING:
+    from scipy import special, stats
+else:
+    special, stats = lazy_module("scipy.special"), lazy_module("scipy.stats")
 
 LEVEL = 0.95  # confidence level of all intervals
 
@@ -143,15 +146,13 @@ def presentation_order(times: ArrayLike, labels: ArrayLike) -> PresentationOrder
     >>> presentation_order([1, 2, 3, 4, 5, 6, 7, 8, 9], list("aaabbbccc")).share
     0.9
     """
-    from scipy.stats import rankdata
-
     names, codes = np.unique(np.asarray(labels), return_inverse=True)
     order = np.asarray(times, dtype=np.float64)
     counts = np.bincount(codes)
     if len(names) < 3 or counts.min() < 2 or not np.isfinite(order).all() or not np.ptp(order):
         return None
     # Trials that begin together have the mean of their ranks.
-    ranks = rankdata(order)
+    ranks = stats.rankdata(order)
     ranks = ranks - ranks.mean()
     share = float((np.bincount(codes, weights=ranks) ** 2 / counts).sum() / (ranks**2).sum())
     between, within = len(names) - 1, len(order) - len(names)

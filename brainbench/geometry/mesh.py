@@ -20,15 +20,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import DataError, UsageError, brief, check_name, check_number, unknown_name
 from brainbench.core.files import atomic_path, content_hash, without_last_digits
-from brainbench.core.lazy import LazyModule
+from brainbench.core.lazy import lazy_module
 from brainbench.core.reading.regular import MOST_PART, check_file, part_of, readable
 
 if TYPE_CHECKING:
     import trimesh
+    from scipy import spatial
 else:
-    trimesh = LazyModule("trimesh")
-
-spatial = LazyModule("scipy.spatial")
+    trimesh, spatial = lazy_module("trimesh"), lazy_module("scipy.spatial")
 
 MERGE = 1e-6  # vertices of an open mesh that lie closer than this part of its diagonal are taken for one
 CRACK = 1e-3  # largest part of the surface that a triangle closing a crack may have
@@ -359,12 +358,12 @@ def hull_faces(points: NDArray[np.float64]) -> NDArray[np.int32]:
 
 def face_owners(mesh: Mesh) -> NDArray[np.int64]:
     """Return the number [F] of the piece that each face belongs to: all that are joined by whole edges."""
-    from trimesh.graph import connected_component_labels
-
     # Bodies that meet in one corner are two, each with an inside of its own. Edges are joined by their triangles.
     ends = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     edges = np.unique(ends[:, 0] * len(mesh.vertices) + ends[:, 1], return_inverse=True)[1].reshape(-1, 3)
-    return connected_component_labels(edges[:, [0, 1, 1, 2]].reshape(-1, 2), node_count=edges.max() + 1)[edges[:, 0]]
+    return trimesh.graph.connected_component_labels(edges[:, [0, 1, 1, 2]].reshape(-1, 2), node_count=edges.max() + 1)[
+        edges[:, 0]
+    ]
 
 
 def _folded_edges(mesh: Mesh, pairs: NDArray[np.int64]) -> int:
@@ -583,14 +582,14 @@ class _Surface:
 
 def point_triangle_distance(points: NDArray[np.float64], triangles: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the distances [n] of points [n, 3] from one triangle each [n, 3, 3]."""
-    from trimesh.triangles import closest_point
-
     # trimesh compares with tolerances in metres, which are wrong for triangles of a millimetre: each is made one long.
     size = np.ptp(triangles, axis=1).max(axis=1)
     size[size == 0] = 1.0
     origin, scale = triangles[:, :1], size[:, None]
     there = (points - origin[:, 0]) / scale
-    return size * np.linalg.norm(there - closest_point((triangles - origin) / scale[:, None], there), axis=1)
+    return size * np.linalg.norm(
+        there - trimesh.triangles.closest_point((triangles - origin) / scale[:, None], there), axis=1
+    )
 
 
 def _farthest_outside(solid: Mesh, inside: Mesh, points: NDArray, rng: np.random.Generator) -> float:

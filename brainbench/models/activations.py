@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.core.errors import BrainbenchError, UsageError, check_each, check_number, listing, unknown_name
-from brainbench.core.lazy import LazyModule
+from brainbench.core.lazy import lazy_module
 from brainbench.core.plugins import load_optional, optional_parts
 from brainbench.core.reading.regular import temporary_folder
 
@@ -32,8 +32,7 @@ if TYPE_CHECKING:
     from brainbench.models import proof
     from brainbench.models.proof import Layout
 else:
-    torch = LazyModule("torch")
-    proof = LazyModule("brainbench.models.proof")
+    torch, proof = lazy_module("torch"), lazy_module("brainbench.models.proof")
 
 _log = logging.getLogger(__name__)
 

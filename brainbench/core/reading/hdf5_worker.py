@@ -17,14 +17,13 @@ import stat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from brainbench.core.lazy import LazyModule
+from brainbench.core.lazy import lazy_module
 
 if TYPE_CHECKING:
     import h5py
+    import numpy as np
 else:
-    h5py = LazyModule("h5py")
+    h5py, np = lazy_module("h5py"), lazy_module("numpy")
 
 MOST_MEMORY = 2 << 30  # bytes that an array may take beyond MOST_EXPANSION times what is stored of it
 MOST_EXPANSION = 200  # bytes of an array for each stored one; recordings reach about 20, a decompression bomb 1000

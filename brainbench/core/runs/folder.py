@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from brainbench.core.errors import DataError, UsageError, brief, check_number
 from brainbench.core.files import is_temporary, lock_folder, read_mapping, to_plain, write_json, write_tensors
-from brainbench.core.lazy import LazyModule
+from brainbench.core.lazy import lazy_module
 from brainbench.core.reading.regular import check_file, readable, reason
 from brainbench.core.reading.tensors import check_finite
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import torch
     from torch import nn
 else:
-    torch = LazyModule("torch")
+    torch = lazy_module("torch")
 
 RUN, CONFIG = "run.json", "config.json"
 RESTART = "Delete it to start anew."

@@ -32,7 +32,7 @@ from brainbench.core.errors import (
     listing,
 )
 from brainbench.core.files import cache_dir, content_hash, hash_arrays, read_json
-from brainbench.core.lazy import LazyModule
+from brainbench.core.lazy import lazy_module
 from brainbench.core.limits import Count, Seed, limited
 from brainbench.core.plugins import load_optional
 from brainbench.core.progress import Progress, track
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     import torch
     from numpy.typing import NDArray
 else:
-    torch = LazyModule("torch")
+    torch = lazy_module("torch")
 
 FOLDERS = {"train": "train", "validate": "validation", "validation": "validation", "val": "validation", "test": "test"}
 """Folders of the published study's sweeps → split."""
