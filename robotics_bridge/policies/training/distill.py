@@ -148,57 +148,11 @@ def _require_sizes(path: Path, config: DistillConfig, shapes: Mapping[str, tuple
         raise DataError(f"The weights in {str(path.parent)!r} are of another student than {CONFIG} describes.")
 
 
-@dataclass
-class Rollout:
-    """T control steps of B environments."""
-
-    parts: dict[str, torch.Tensor]
-    """By name [T, B, …]: observation groups that the student or its decoders read; ``features`` [F] of a frozen encoder
-    in place of the readings; actions [A] of ``teacher`` and ``student``; ``ended``: an episode did after the step."""
-    memory: torch.Tensor
-    """The student's memory [B, H] before the first step."""
-
-    @property
-    def steps(self) -> int:
-        """T."""
-        return len(self.parts["teacher"])
-
-    def chunk(self, first: int, length: int) -> dict[str, torch.Tensor]:
-        """Return the steps from one on, ``length`` or what is left: views [L, B, …] of all but the memory."""
-        return {name: value[first : first + length] for name, value in self.parts.items()}
-
-    def save(self, path: Path) -> None:
-        """Write the rollout to a safetensors file."""
-        write_tensors(path, {**self.parts, "memory": self.memory})
-
-    @classmethod
-    def load(cls, path: Path, device: torch.device) -> Rollout:
-        """Read what :meth:`save` wrote."""
-        parts = {name: value.to(device) for name, value in load_file(path).items()}
-        return cls(parts, parts.pop("memory"))
-
-
-class Recorder:
-    """Collects the steps of a rollout in tensors of their final size."""
-
-    def __init__(self, steps: int, memory: torch.Tensor) -> None:
-        self.rollout = Rollout({}, memory.clone())
-        self._steps, self._step = steps, 0
-
-    def put(self, **values: torch.Tensor) -> None:
-        """Keep values of the present step."""
-        parts = self.rollout.parts
-        for name, value in values.items():
-            if name not in parts:
-                parts[name] = torch.empty(self._steps, *value.shape, dtype=value.dtype, device=value.device)
-            parts[name][self._step].copy_(value)
-
-    def next(self) -> None:
-        """Go on to the next step."""
-        self._step += 1
-
-
 Tensors = dict[str, torch.Tensor]
+Rollout = Tensors
+"""T control steps of B environments by name [T, B, …]: observation groups that the student or its decoders read;
+``features`` [F] of a frozen encoder in place of the readings; actions [A] of ``teacher`` and ``student``; ``ended``: an
+episode did after the step. ``memory`` is the student's [B, H] before the first step."""
 
 
 class ChunkStep:
@@ -339,7 +293,7 @@ class _Run:
         env.episode_length_buf.copy_(torch.randint_like(env.episode_length_buf, int(env.max_episode_length)))
         self.memory = self.student.zeros(env.num_envs, stored=self.front is not None)
         self.touched = self.front.init_state(env.num_envs) if self.front is not None else self.memory[:, :0]
-        self.kept: list[tuple[int, Rollout]] = []
+        self.rollouts: dict[int, Rollout] = {}
         self.iteration, self.saved, self.loss = 0, 0, math.nan
         self._claim()
         if (out / STATE).exists():
@@ -364,7 +318,7 @@ class _Run:
             self.loss = losses["behaviour"]
             self.iteration += 1
             acting, learning = acted - begun, time.perf_counter() - acted
-            steps = rollout.steps * self.env.num_envs
+            steps = rollout["ended"].numel()
             self.log.write("loss", self.iteration, **losses)
             self.log.write("time", self.iteration, acting=acting, learning=learning, steps_per_second=steps / acting)
             self.log.write("teacher", self.iteration, share=self.config.share(self.iteration - 1))
@@ -382,20 +336,19 @@ class _Run:
     @torch.no_grad()
     def _act(self, share: float) -> Rollout:
         """Step the environments; the teacher takes a share of the actions and labels all."""
-        recorder = Recorder(self.config.steps_per_env, self.memory)
+        steps, rollout = self.config.steps_per_env, {"memory": self.memory.clone()}
+        rollout["ended"] = torch.empty(steps, len(self.memory), dtype=torch.bool, device=self.device)
         targets = [head.target for head in self.decoders]
         recorded = [name for name in (*self.groups, *targets) if self.front is None or name != TACTILE]
         self.student.eval()
-        for _ in range(self.config.steps_per_env):
-            obs = self.observations
-            features = None
+        for step in range(steps):
+            obs, features = self.observations, None
+            row = {name: obs[name] for name in recorded}
             if self.front is not None:
                 with torch.autocast(self.device.type, self.precision, enabled=self.precision is not None):
                     features, self.touched = self.front(obs[TACTILE], self.touched)
                 features, self.touched = features.float(), self.touched.float()
-                recorder.put(features=features)
-            # The environment may write its next observations over these.
-            recorder.put(**{name: obs[name] for name in recorded})
+                row["features"] = features
             now = {name: obs[name][None] for name in self.groups}
             latent, memory = self.student.unroll(now, self.memory, None, None if features is None else features[None])
             action = self.student.action_of(latent[0]).float()
@@ -403,26 +356,32 @@ class _Run:
             # Ross et al. 2011: the student's own states are visited, a share of actions being the teacher's, and the
             # teacher labels them all.
             taught = torch.rand(len(action), 1, device=self.device) < share
+            row |= {"teacher": right, "student": action}
+            for name, value in row.items():
+                if name not in rollout:
+                    rollout[name] = value.new_empty(steps, *value.shape)
+                # The environment may write its next observations over these.
+                rollout[name][step].copy_(value)
             self.observations, _, terminated, truncated, _ = self.env.step(torch.where(taught, right, action))
             ended = terminated | truncated
-            recorder.put(teacher=right, student=action, ended=ended)
-            recorder.next()
+            rollout["ended"][step].copy_(ended)
             self.memory = torch.where(ended[:, None], 0.0, memory.float())
             if self.front is not None:
                 self.touched = torch.where(ended[:, None], 0.0, self.touched)
-        return recorder.rollout
+        return rollout
 
     def _learn(self, rollout: Rollout) -> dict[str, float]:
         """Take the steps of one iteration; return the mean losses over its first epoch on the new rollout."""
         self.learner.train()
-        self.student.update_normalization(rollout.parts)
+        self.student.update_normalization(rollout)
         if self.config.aggregate:
-            self.kept = [*self.kept, (self.iteration, rollout)][-self.config.aggregate :]
+            self.rollouts[self.iteration] = rollout
+            self.rollouts = {number: self.rollouts[number] for number in [*self.rollouts][-self.config.aggregate :]}
         losses: dict[str, torch.Tensor] = {}
         for _ in range(self.config.epochs or 1):
             means = self._pass(rollout)
             losses = losses or means
-            older = [item for _, item in self.kept if item is not rollout]
+            older = [other for other in self.rollouts.values() if other is not rollout]
             if older:
                 self._pass(older[int(torch.randint(len(older), ()))])
         return {name: float(value) for name, value in losses.items()}
@@ -430,15 +389,15 @@ class _Run:
     def _pass(self, rollout: Rollout) -> dict[str, torch.Tensor]:
         """Go once through a rollout, a gradient step every ``gradient_length`` steps."""
         length = self.config.gradient_length or 1
-        memory = rollout.memory
-        scale = torch.ones(rollout.parts["teacher"].shape[-1], device=self.device)
+        memory, steps = rollout["memory"], len(rollout["teacher"])
+        scale = torch.ones(rollout["teacher"].shape[-1], device=self.device)
         if self.config.loss == "inv_var_mse":
             # Error of each joint in units of the teacher's own variance, bounded below for joints that hardly move.
-            scale = 1 / rollout.parts["teacher"].flatten(0, 1).var(0).clamp(min=_LEAST_VARIANCE)
+            scale = 1 / rollout["teacher"].flatten(0, 1).var(0).clamp(min=_LEAST_VARIANCE)
         sums: dict[str, torch.Tensor] = {}
-        for first in range(0, rollout.steps, length):
-            chunk = rollout.chunk(first, length)
-            share = len(chunk["teacher"]) / rollout.steps
+        for first in range(0, steps, length):
+            chunk = {name: value[first : first + length] for name, value in rollout.items()}
+            share = len(chunk["teacher"]) / steps
             parts, memory = self.step({**chunk, "memory": memory, "scale": scale})
             sums = {name: sums.get(name, 0) + share * value for name, value in parts.items()}
         return sums
@@ -484,12 +443,11 @@ class _Run:
 
     def _save(self) -> None:
         """Write the state, the rollouts that are learned from again, and the student."""
-        numbers = [number for number, _ in self.kept]
-        for number, rollout in self.kept:
+        for number, rollout in self.rollouts.items():
             # A file of this number from before the last state was left by a run that ended while it saved.
             if number >= self.saved:
-                rollout.save(self.out / "rollouts" / f"{number}.safetensors")
-        reached = {"iteration": self.iteration, "loss": self.loss, "rollouts": numbers}
+                write_tensors(self.out / "rollouts" / f"{number}.safetensors", rollout)
+        reached = {"iteration": self.iteration, "loss": self.loss, "rollouts": [*self.rollouts]}
         world = {"env": self.env.state_dict(), "memory": self.memory, "touched": self.touched}
         random = random_state(self.device)
         # The student first: a run that its state says is finished is not saved again.
@@ -499,7 +457,7 @@ class _Run:
         )
         self.saved = self.iteration
         for path in (self.out / "rollouts").glob("*.safetensors"):
-            if int(path.stem) not in numbers:
+            if int(path.stem) not in self.rollouts:
                 path.unlink()
 
     def _go_on(self, state: Mapping[str, Any]) -> None:
@@ -515,10 +473,9 @@ class _Run:
         self.env.load_state_dict(state["env"])
         self.observations = self.env.observations
         self.memory, self.touched = (state[name].to(self.device) for name in ("memory", "touched"))
-        self.kept = [
-            (number, Rollout.load(self.out / "rollouts" / f"{number}.safetensors", self.device))
-            for number in state["rollouts"]
-        ]
+        for number in state["rollouts"]:
+            stored = load_file(self.out / "rollouts" / f"{number}.safetensors")
+            self.rollouts[number] = {name: value.to(self.device) for name, value in stored.items()}
         set_random_state(state["random"], self.device)
 
 
