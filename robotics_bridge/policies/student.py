@@ -178,11 +178,6 @@ class PolicyCore(nn.Module):
             parts.append(y.float() if mixed else y)
         return torch.cat(parts, -1), torch.cat([state.to(h_in.dtype) for state in states], 1)
 
-    def forward(self, flat: Sequence[torch.Tensor], taxels: torch.Tensor | None, h_in: torch.Tensor) -> Stepped:
-        """Return (latent [B, D], h_out [B, H]) of one step; arguments as of :meth:`unroll`, without L."""
-        latents, h_out = self.unroll([x[None] for x in flat], None if taxels is None else taxels[None], h_in)
-        return latents[0], h_out
-
 
 class TactilePolicy(MLPModel):
     """A policy that feels; a drop-in for rsl_rl's models, with two more arguments.
@@ -364,28 +359,18 @@ class StepPolicy(nn.Module):
 
     def __init__(self, policy: TactilePolicy) -> None:
         super().__init__()
-        # Its parts, and not the policy itself: what its distribution last drew hangs on a graph and cannot be copied.
-        parts = (policy.obs_normalizer, policy.core, policy.mlp)
-        self.normaliser, self.core, self.mlp = (copy.deepcopy(part).cpu().float().eval() for part in parts)
-        sampled = policy.distribution
+        # What its distribution last drew, and what it remembers, hang on a graph and cannot be copied.
+        sampled, without = policy.distribution, {id(part): None for part in (policy.distribution, policy._state)}
+        self.policy: TactilePolicy = copy.deepcopy(policy, without).cpu().float().eval()  # type: ignore[arg-type]
         self.output: nn.Module = nn.Identity() if sampled is None else sampled.as_deterministic_output_module().cpu()
-        self.shapes: dict[str, tuple[int, ...]] = policy.shapes
-        self.flat: tuple[str, ...] = tuple(policy.obs_groups)
-        self.state_size: int = policy.core.state_size
-        """H."""
-        self.input_names, self.output_names = [*self.shapes, "h_in"], ["actions", "h_out"]
+        self.input_names, self.output_names = [*policy.shapes, "h_in"], ["actions", "h_out"]
 
     def forward(self, *inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return actions [B, A] and memory [B, H] of a control step; groups stand as in :attr:`input_names`."""
-        obs = dict(zip(self.shapes, inputs[:-1], strict=True))
-        flat: list[torch.Tensor] = []
-        if self.flat:
-            sizes = [self.shapes[name][0] for name in self.flat]
-            flat = list(self.normaliser(torch.cat([obs[name] for name in self.flat], -1)).split(sizes, -1))
-        taxels = next((obs[name] for name in self.shapes if name not in self.flat), None)
-        latent, h_out = self.core(flat, taxels, inputs[-1])
-        return self.output(self.mlp(latent)), h_out
+        latent, h_out = self.policy.advance(dict(zip(self.input_names, inputs, strict=True)), inputs[-1])
+        return self.output(self.policy.mlp(latent)), h_out
 
     def get_dummy_inputs(self, batch: int = 1) -> tuple[torch.Tensor, ...]:
         """Return inputs [B, …] of zeros."""
-        return (*(torch.zeros(batch, *shape) for shape in self.shapes.values()), torch.zeros(batch, self.state_size))
+        shapes = (*self.policy.shapes.values(), (self.policy.core.state_size,))
+        return tuple(torch.zeros(batch, *shape) for shape in shapes)
