@@ -27,7 +27,6 @@ from brainbench.core.limits import Limit, check_value, limited
 from robotics_bridge import hands
 from robotics_bridge.deploy.driver import Clock, Driver, HandReading, Source
 from robotics_bridge.deploy.safety import Command, SafeLink, SafetyLimits
-from robotics_bridge.envs import ActionMap
 from robotics_bridge.envs.step import VELOCITY
 from robotics_bridge.policies.contract import RATE, PolicyContract
 from robotics_bridge.policies.export import Runner, read_policy
@@ -178,8 +177,6 @@ class Controller:
             raise UsageError(f"There are limits of {len(limits.low)} joints; the hand has {len(driver.joints)}.")
         if missing := [name for name in contract.joints if name not in driver.joints]:
             raise UsageError(f"The policy moves the joint {missing[0]!r}, which the hand does not have.")
-        self.actions = ActionMap(contract.moved, **{name: np.array(row) for name, row in contract.action_map.items()})
-        """From actions to targets, as the policy was trained."""
         self._order = [driver.joints.index(name) for name in contract.joints]
         self._action = np.zeros(len(contract.moved), np.float32)
         self._targets: NDArray[np.float64] | None = None
@@ -250,7 +247,7 @@ class Controller:
             # What counts and is observed as the last action, as in training (``Task.action_limit``).
             action = np.clip(action, -limit, limit)
         self._action = action.astype(np.float32)
-        moved = zip(self.contract.moved, self.actions.targets(action).tolist(), strict=True)
+        moved = zip(self.contract.moved, self.contract.action_map.targets(action).tolist(), strict=True)
         targets, limited = self._limit({**self.contract.frozen, **dict(moved)}, reading)
         # Whatever took its time since the report was read: sources, the policy, or this computer.
         if (reason := self.link.send(Command(targets, reading, deadline))) is not None:

@@ -100,7 +100,8 @@ class Env:
         """The map from actions to joint targets."""
         columns = [self.model.joints.index(name) for name in self.model.moved]
         low, high = self.model.low[columns], self.model.high[columns]
-        return ActionMap(self.model.moved, self.model.rest[columns], self.task.action_ratio * (high - low), low, high)
+        rows = (self.model.rest[columns], self.task.action_ratio * (high - low), low, high)
+        return ActionMap(self.model.moved, *(tuple(row.tolist()) for row in rows))
 
     @property
     def frozen(self) -> dict[str, float]:

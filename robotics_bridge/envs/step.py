@@ -7,12 +7,14 @@ Beginnings of episodes: where hand and object start, what the object weighs, and
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
-from typing import Any
+from dataclasses import asdict, dataclass
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from brainbench.core.devices import mujoco_module
@@ -109,28 +111,31 @@ StepResult = tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Te
 _DIVERGED_SPEED = 1e4  # speed (m/s or rad/s) beyond which an environment counts as diverged
 
 
-@dataclass(frozen=True, eq=False)
+JOINTS = 255  # most joints; a frame counts them in one byte
+Name = Annotated[str, Meta(min_length=1, max_length=4096)]
+Names = Annotated[tuple[Name, ...], Meta(min_length=1, max_length=JOINTS)]
+Angle = Annotated[float, Meta(ge=-4 * math.pi, le=4 * math.pi)]  # position of a joint (rad)
+_Scale = Annotated[float, Meta(ge=-10, le=10)]  # 0 is not allowed
+
+
+@dataclass(frozen=True)
 class ActionMap:
     """The map from actions to targets of the actuators: target = clip(default + scale · action, low, high)."""
 
-    names: tuple[str, ...]
+    names: Names
     """Names of the joints A."""
-    default: np.ndarray
+    default: tuple[Angle, ...]
     """[A] targets of zero actions (rad)."""
-    scale: np.ndarray
+    scale: tuple[_Scale, ...]
     """[A] (rad per unit of action)."""
-    low: np.ndarray
+    low: tuple[Angle, ...]
     """[A] least targets (rad)."""
-    high: np.ndarray
+    high: tuple[Angle, ...]
     """[A] greatest targets (rad)."""
 
     def targets(self, action: np.ndarray) -> np.ndarray:
         """Return the targets [..., A] (rad) of actions [..., A]."""
-        return np.clip(self.default + self.scale * action, self.low, self.high)
-
-    def plain(self) -> dict[str, list[Any]]:
-        """Return the map as files hold it."""
-        return {field.name: np.asarray(getattr(self, field.name)).tolist() for field in fields(self)}
+        return np.clip(np.array(self.default) + np.array(self.scale) * action, self.low, self.high)
 
 
 def apply_action(state: EnvState) -> None:

@@ -11,7 +11,7 @@ import json
 import logging
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
 
@@ -21,6 +21,7 @@ from msgspec import Meta
 from brainbench.core.errors import DataError, UsageError, brief, check_each, listing, repeats
 from brainbench.core.files import read_mapping, to_json, to_plain
 from brainbench.core.reading.values import typed_values
+from robotics_bridge.envs.step import ActionMap, Angle, Name, Names
 from robotics_bridge.hands.observations import OBSERVATIONS
 from robotics_bridge.policies.shipped import stored
 from robotics_bridge.tasks.settings import CONTACTS, ContactModel, contacts_name
@@ -29,10 +30,7 @@ from robotics_bridge.tasks.task import MEASURED, TASK_VERSION, Task
 if TYPE_CHECKING:
     from robotics_bridge.envs.env import Env
 
-JOINTS = 255  # most joints; a frame counts them in one byte
 MOST_NUMBERS = 10_000_000  # most numbers of all observations, and of a policy's memory
-Name = Annotated[str, Meta(min_length=1, max_length=4096)]
-Names = Annotated[tuple[Name, ...], Meta(min_length=1, max_length=JOINTS)]
 Sizes = Annotated[tuple[Annotated[int, Meta(ge=1, le=MOST_NUMBERS)], ...], Meta(min_length=1, max_length=3)]
 Groups = Annotated[tuple[tuple[Name, Sizes], ...], Meta(min_length=1)]
 """Group and shape of each observation; a list, since JSON keeps the order of lists alone."""
@@ -68,25 +66,17 @@ RATE = (1.0, 1000.0)
 MOST_TWIST = 100.0  # N·m·s
 REQUIRED = ("action_map", "contacts", "frozen", "hand", "joints", "rate", "twist")
 """What ``deployment`` must say before a hand can run the policy."""
-_Angle = Annotated[float, Meta(ge=-4 * math.pi, le=4 * math.pi)]  # position of a joint (rad)
-_Scale = Annotated[float, Meta(ge=-10, le=10)]  # radians per unit of action; 0 is not allowed
 
 
-class TrainedMap(msgspec.Struct, frozen=True):
+@dataclass(frozen=True)
+class TrainedMap(ActionMap):
     """The map from actions to targets as it stands in a file; ValueError where it is none."""
-
-    names: Names
-    """Joints A that actions move."""
-    default: tuple[_Angle, ...]
-    scale: tuple[_Scale, ...]
-    low: tuple[_Angle, ...]
-    high: tuple[_Angle, ...]
 
     def __post_init__(self) -> None:
         if twice := repeats(self.names):
             raise ValueError(f"'names' has {twice[0][:80]!r} twice")
-        for name, row in self.rows().items():
-            if len(row) != len(self.names):
+        for name in ("default", "scale", "low", "high"):
+            if len(row := getattr(self, name)) != len(self.names):
                 raise ValueError(f"{name!r} has {len(row)} numbers for {len(self.names)} joints")
         for low, high, scale in zip(self.low, self.high, self.scale, strict=True):
             if not low < high:
@@ -94,76 +84,49 @@ class TrainedMap(msgspec.Struct, frozen=True):
             if scale == 0:
                 raise ValueError("'scale' of a joint that actions move must not be 0")
 
-    def rows(self) -> dict[str, tuple[float, ...]]:
-        """Return ``default``, ``scale``, ``low`` and ``high`` [A] (rad) by name."""
-        return {"default": self.default, "scale": self.scale, "low": self.low, "high": self.high}
-
-
-class _Deployment(msgspec.Struct):
-    rate: Annotated[float, Meta(ge=RATE[0], le=RATE[1])]
-    hand: Name
-    joints: Names
-    action_map: TrainedMap
-    frozen: dict[str, _Angle]
-    twist: Annotated[float, Meta(ge=0, le=MOST_TWIST)] | None
-    links: tuple[Name, ...] = ()
-    observe: str = "none"
-    task: Name | None = None
-    placement: Name | None = None
-    resolution: Name | None = None
-    probes: Name | None = None
-    sub_steps: Annotated[int, Meta(ge=1, le=1000)] | None = None
-    command: tuple[Annotated[float, Meta(ge=-1e6, le=1e6)], ...] | None = None
-    action_limit: Annotated[float, Meta(ge=1e-6, le=1e6)] | None = None
-    starts: Name | None = None
-
-
-class _Written(msgspec.Struct):
-    format: Literal["onnx"]
-    inputs: Groups
-    deployment: _Deployment
-    sha256: str = ""
-
 
 @dataclass(frozen=True, eq=False)
 class PolicyContract:
-    """What the file of an exported policy reads, and what a robot needs to run it."""
+    """What the file of an exported policy reads, and what a robot needs to run it: the latter as files hold it."""
 
-    inputs: Mapping[str, tuple[int, ...]]
-    """Group → shape, in the order of the file."""
-    rate: float
+    rate: Annotated[float, Meta(ge=RATE[0], le=RATE[1])]
     """Control steps per second."""
-    hand: str
+    hand: Name
     """Name of the hand that it was trained on."""
-    joints: tuple[str, ...]
+    joints: Names
     """All driven joints J, in the order of ``proprio``."""
-    moved: tuple[str, ...]
-    """Joints A that actions move."""
-    action_map: Mapping[str, tuple[float, ...]]
-    """``default``, ``scale``, ``low`` and ``high`` [A] (rad)."""
-    frozen: Mapping[str, float]
+    action_map: TrainedMap
+    """Map from actions to targets of the joints A that it moves."""
+    frozen: dict[str, Angle]
     """Joint → position (rad) of those that actions do not move."""
-    links: tuple[str, ...] = ()
+    twist: Annotated[float, Meta(ge=0, le=MOST_TWIST)] | None = None
+    """Torsional friction of force taxels [N·m·s]; None: they hold. The rest is None where nothing is stated."""
+    contacts: ContactModel = CONTACTS["published"]
+    """Contact model in which it was trained."""
+    inputs: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    """Group → shape, in the order of the file."""
+    links: tuple[Name, ...] = ()
     """Links with touch, in the order of ``tactile``."""
     observe: str = "none"
     """Tactile observation type."""
     sha256: str = ""
     """Hash of the file of the network; empty in contracts of earlier versions."""
-    contacts: ContactModel = CONTACTS["published"]
-    """Contact model in which it was trained."""
-    twist: float | None = None
-    """Torsional friction of force taxels [N·m·s]; None: they hold. The rest is None where nothing is stated."""
-    task: str | None = None
-    placement: str | None = None
-    resolution: str | None = None
-    probes: str | None = None
+    task: Name | None = None
+    placement: Name | None = None
+    resolution: Name | None = None
+    probes: Name | None = None
     """Hash of a probe file."""
-    sub_steps: int | None = None
-    command: tuple[float, ...] | None = None
+    sub_steps: Annotated[int, Meta(ge=1, le=1000)] | None = None
+    command: tuple[Annotated[float, Meta(ge=-1e6, le=1e6)], ...] | None = None
     """What it is told by default."""
-    action_limit: float | None = None
-    starts: str | None = None
+    action_limit: Annotated[float, Meta(ge=1e-6, le=1e6)] | None = None
+    starts: Name | None = None
     """What episodes began with, such as ``grasps``, and actions were counted from; None: from ``action_map``."""
+
+    @property
+    def moved(self) -> tuple[str, ...]:
+        """Joints A that actions move."""
+        return self.action_map.names
 
     @classmethod
     def read(cls, path: Path) -> PolicyContract:
@@ -188,7 +151,7 @@ class PolicyContract:
             )
         written = from_json(_Written, document, where)
         given, inputs = written.deployment, shapes_of(written.inputs, where, "inputs")
-        joints, moved = given.joints, given.action_map.names
+        joints, moved = given.joints, given.moved
         if sorted((*moved, *given.frozen)) != sorted(joints) or repeats(joints):
             allowed = "every joint stands there once, and either in 'action_map' or in 'frozen'"
             raise wrong(where, "deployment.joints", joints, allowed)
@@ -196,20 +159,25 @@ class PolicyContract:
         if inputs.get("proprio", (size,)) != (size,):
             allowed = f"with {len(joints)} joints and {len(moved)} actions it is ({size},)"
             raise wrong(where, "inputs.proprio", inputs["proprio"], allowed)
-        links, observe = (given.links, given.observe) if "tactile" in inputs else ((), "none")
+        touch: dict[str, Any] = {"links": (), "observe": "none"}
         if "tactile" in inputs:
+            touch = {}
             _check_touch(given, inputs["tactile"], where)
         command = given.command if "command" in inputs else None
         if command is not None and len(command) != (count := math.prod(inputs["command"])):
             raise wrong(where, "deployment.command", command, f"the policy reads {count} numbers")
-        return cls(
-            inputs, given.rate, given.hand, joints, moved, given.action_map.rows(), given.frozen, links, observe,
-            written.sha256, trained_contacts(deployment, where), given.twist, given.task, given.placement,
-            given.resolution, given.probes, given.sub_steps, command, given.action_limit, given.starts,
-        )  # fmt: skip
+        read = {"inputs": inputs, "sha256": written.sha256, "contacts": trained_contacts(deployment, where)}
+        return replace(given, **read, command=command, **touch)
 
 
-def _check_touch(given: _Deployment, shape: tuple[int, ...], where: str) -> None:
+class _Written(msgspec.Struct):
+    format: Literal["onnx"]
+    inputs: Groups
+    deployment: PolicyContract
+    sha256: str = ""
+
+
+def _check_touch(given: PolicyContract, shape: tuple[int, ...], where: str) -> None:
     """Raise DataError unless observation type, links and shape of the touch that a policy reads fit one another."""
     if given.observe not in OBSERVATIONS:
         raise wrong(where, "deployment.observe", given.observe, f"one of {', '.join(OBSERVATIONS)} is allowed")
@@ -313,7 +281,7 @@ def check_actions(described: Mapping[str, Any], env: Env, name: str) -> None:
         )
     sides = (("are counted from", action_map.default, here.default), ("move by", action_map.scale, here.scale))
     for what, theirs, ours in sides:
-        for joint, trained, now in zip(action_map.names, theirs, ours.tolist(), strict=True):
+        for joint, trained, now in zip(action_map.names, theirs, ours, strict=True):
             if abs(trained - now) > _SAME_ANGLE:
                 raise UsageError(
                     f"Actions of the policy {name!r} {what} {joint} = {trained:g} rad, and here {now:g} rad: take the "

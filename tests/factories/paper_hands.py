@@ -9,7 +9,7 @@ import numpy as np
 from robotics_bridge.deploy.controller import Controller
 from robotics_bridge.deploy.driver import Clock, HandReading, LinkCounters
 from robotics_bridge.deploy.safety import SafetyLimits
-from robotics_bridge.policies.contract import PolicyContract
+from robotics_bridge.policies.contract import PolicyContract, TrainedMap
 
 JOINTS = ("a", "b", "c")
 
@@ -62,11 +62,16 @@ class PaperHand:
         pass
 
 
-ACTIONS = {"default": (0.1, 0.2), "scale": (0.5, 0.5), "low": (-1.0, 0.0), "high": (1.0, 0.4)}
+ACTIONS = TrainedMap(("a", "c"), default=(0.1, 0.2), scale=(0.5, 0.5), low=(-1.0, 0.0), high=(1.0, 0.4))
+
+
+def still_map(joints: tuple[str, ...]) -> TrainedMap:
+    """Return a map under which actions of zero leave joints at zero."""
+    return TrainedMap(joints, *((number,) * len(joints) for number in (0.0, 1.0, -1.0, 1.0)))
 
 
 def make_contract(groups=("proprio",), rate=40.0) -> PolicyContract:
-    return PolicyContract(dict.fromkeys(groups, (1,)), rate, "paper", JOINTS, ("a", "c"), ACTIONS, {"b": 0.3})
+    return PolicyContract(rate, "paper", JOINTS, ACTIONS, {"b": 0.3}, inputs=dict.fromkeys(groups, (1,)))
 
 
 def make_limits(**changes) -> SafetyLimits:

@@ -6,7 +6,6 @@ from dataclasses import make_dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import torch
 
 from robotics_bridge import tasks
@@ -25,7 +24,7 @@ class TouchWorld:
         self.num_envs, self.num_actions, self.device = num_envs, 2, torch.device("cpu")
         self.step_dt, self.decimation, self.max_episode_length = 0.025, 5, 8
         self.joint_names, self.frozen = ("a", "b"), {"c": 0.5}
-        self.action_map = ActionMap(("a", "b"), np.zeros(2), np.ones(2), -np.ones(2), np.ones(2))
+        self.action_map = ActionMap(("a", "b"), (0.0, 0.0), (1.0, 1.0), (-1.0, -1.0), (1.0, 1.0))
         self.hand = SimpleNamespace(physics=None)
         self.touch: Any = None
         if observation_type(observe).sensor is not None:

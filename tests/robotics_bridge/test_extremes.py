@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from robotics_bridge.deploy.controller import Controller, PressureCalibration, c
 from robotics_bridge.deploy.driver import Clock, HandReading, LinkCounters
 from robotics_bridge.deploy.links.udp import UdpDriver, new_key
 from robotics_bridge.deploy.safety import SafetyLimits
+from robotics_bridge.envs import ActionMap
 from robotics_bridge.hands.scenes import holding
 from robotics_bridge.physics import Geometry, HandState, MujocoEngine
 from robotics_bridge.policies.contract import PolicyContract
@@ -60,9 +62,10 @@ class _Ticks(Clock):
 
 
 def _controller(hand, policy, *, rate=40.0, **mapping):
-    parts = {"default": np.zeros(2), "scale": np.ones(2), "low": -np.ones(2), "high": np.ones(2), **mapping}
+    parts = {"default": (0.0, 0.0), "scale": (1.0, 1.0), "low": (-1.0, -1.0), "high": (1.0, 1.0), **mapping}
     limits = SafetyLimits(-np.ones(2), np.ones(2), np.full(2, 8.0), timeout=2.0)
-    contract = PolicyContract({"proprio": (6,)}, rate, "paper", hand.joints, hand.joints, parts, {})
+    actions: Any = ActionMap(hand.joints, **parts)
+    contract = PolicyContract(rate, "paper", hand.joints, actions, {}, inputs={"proprio": (6,)})
     return Controller(policy, hand, contract, limits, clock=_Ticks())
 
 

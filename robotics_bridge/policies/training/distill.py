@@ -48,8 +48,9 @@ from brainbench.core.runs.folder import (
     set_random_state,
 )
 from brainbench.core.runs.log import RunLog
+from robotics_bridge.envs.step import JOINTS
 from robotics_bridge.hands.layouts import check_probes, is_probe_file
-from robotics_bridge.policies.contract import JOINTS, Groups, check_hand, check_version, from_json, shapes_of, world_of
+from robotics_bridge.policies.contract import Groups, check_hand, check_version, from_json, shapes_of, world_of
 from robotics_bridge.policies.encoders.arms import EncoderConfig, elu_perceptron
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.shipped import model_file, policy_path, student_folder
@@ -503,7 +504,7 @@ def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dic
             "twist": env.task.taxel_twist,
             "contacts": asdict(env.task.contacts),
             "joints": list(env.joint_names),
-            "action_map": env.action_map.plain(),
+            "action_map": asdict(env.action_map),
             "frozen": dict(env.frozen),
             "links": list(env.touch.links) if env.touch is not None else [],
         },

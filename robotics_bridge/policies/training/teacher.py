@@ -510,7 +510,7 @@ def train(
             "hand_path": "" if env.hand.pads else str(env.hand.path), "hand_physics": env.hand.physics,
             "num_envs": env.num_envs, "seed": options.seed, "settings": asdict(settings), "rsl_rl": trainer.config,
             "observation_shapes": {name: list(shape) for name, shape in env.observation_shapes.items()},
-            "action_names": list(env.action_names), "action_map": env.action_map.plain(), "start": origin,
+            "action_names": list(env.action_names), "action_map": asdict(env.action_map), "start": origin,
             "task_version": TASK_VERSION, "contacts": asdict(env.task.contacts), "observe": list(options.observe),
             "rate": 1 / env.step_dt, "world": world_of(env.task), "sensing": to_plain(trainer.sensing),
         }  # fmt: skip

@@ -35,7 +35,7 @@ from robotics_bridge.policies.export import export_policy
 from robotics_bridge.policies.training.distill import build_student, describe_run
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.tasks.task import ObservationNoise
-from tests.factories.paper_hands import OwnClock, PaperHand, make_contract, make_limits, run_session
+from tests.factories.paper_hands import OwnClock, PaperHand, make_contract, make_limits, run_session, still_map
 from tests.factories.policies import contract_of
 
 linux = pytest.mark.skipif(not hasattr(os, "SCHED_FIFO"), reason="SCHED_FIFO is Linux's")
@@ -356,7 +356,8 @@ JOINTS = ("a", "b", "c")
 def _touching(observe: str, shape: tuple[int, ...]) -> PolicyContract:
     body = hands.load("xhand1")
     links = (body.palm, body.fingers["index"][-1], body.fingers["thumb"][-1])
-    return PolicyContract({"tactile": shape}, 40.0, "xhand1", JOINTS, JOINTS, {}, {}, links, observe)
+    still = still_map(JOINTS)
+    return PolicyContract(40.0, "xhand1", JOINTS, still, {}, inputs={"tactile": shape}, links=links, observe=observe)
 
 
 def test_real_values_fill_all_slots_and_simulated_ones_the_rest() -> None:

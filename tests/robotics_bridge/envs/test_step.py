@@ -94,7 +94,7 @@ def test_episodes_end_when_their_time_is_up_and_say_so() -> None:
 
 def test_actions_map_to_targets_within_the_joints_limits() -> None:
     env = make_env(1, config="published")
-    low, high = env.action_map.low, env.action_map.high
+    low, high = np.array(env.action_map.low), np.array(env.action_map.high)
     targets = env.action_map.targets(np.array([1.0, 1.0, 1.0, 1.0, 1.0]))
     np.testing.assert_allclose(targets, np.clip(0.5 * (high - low), low, high))
     assert (env.action_map.targets(np.full(5, -9.0)) == low).all()

@@ -45,7 +45,7 @@ def test_a_hand_that_holds_the_hot_ball_succeeds_by_default_alone() -> None:
     thermometers: Any = env.state.task_state
     published = Thermometers(env.state, ThermalSettings(), chooses=False)
     slides = [env.action_names.index(f"carriage_{axis}") for axis in "xyz"]
-    scale = torch.as_tensor(env.action_map.scale[slides], dtype=torch.float32)
+    scale = torch.tensor(env.action_map.scale)[slides]
     middle = env.state.contacts.tip_links[list(env.model.tips).index("right_hand_mid_link2")]
     at, pressed, held = torch.zeros(2, 3), torch.zeros(2), torch.zeros(2)
     for step in range(250):

@@ -34,6 +34,7 @@ from robotics_bridge.deploy.links.simulated_hand import SimulatedHand
 from robotics_bridge.hands.observations import observe
 from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid, finger_axes_of
+from tests.factories.paper_hands import still_map
 from tests.robotics_bridge.hands.test_grippers import JAWS, LINK, URDF
 
 HAND = hands.load("xhand1")
@@ -43,7 +44,7 @@ PLACES = [[getattr(probes, name)[probes.active] for probes in PROBES.values()] f
 LINKS = tuple(np.repeat(list(PROBES), list(map(len, PLACES[0]))).tolist())
 POINTS = TactilePoints(LINKS, *map(np.concatenate, PLACES))
 SESSION = SessionFacts(task="turn the ball", fps=40, joints=HAND.joints, points=POINTS, robot="xhand1", unit="N")
-CONTRACT = PolicyContract({}, 40.0, "xhand1", HAND.joints, HAND.joints, {}, {})
+CONTRACT = PolicyContract(40.0, "xhand1", HAND.joints, still_map(HAND.joints), {})
 
 
 def _frames(length: int) -> dict[str, np.ndarray]:

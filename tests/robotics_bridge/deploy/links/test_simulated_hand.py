@@ -15,6 +15,7 @@ from robotics_bridge.deploy.links.simulated_hand import ShadowTouch, SimulatedHa
 from robotics_bridge.hands.scenes import closing
 from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.tasks.settings import CONTACTS
+from tests.factories.paper_hands import still_map
 from tests.robotics_bridge.hands.test_grippers import JAWS, LINK, URDF
 
 HAND = hands.load("xhand1")
@@ -29,8 +30,8 @@ def _reading(position, pressure=None, *, step: int = 0, velocity=None) -> HandRe
 def _contract(observe: str, joints: tuple[str, ...] = HAND.joints) -> PolicyContract:
     links = tuple(HAND.layout("low", "hand"))
     more = {"placement": "hand", "resolution": "low", "sub_steps": 5, "twist": None, "contacts": CONTACTS["firm"]}
-    inputs = {"tactile": (5, len(links), 3)}
-    return PolicyContract(inputs, 40.0, "xhand1", joints, joints, {}, {}, links, observe, "", **more)
+    more |= {"inputs": {"tactile": (5, len(links), 3)}, "links": links, "observe": observe}
+    return PolicyContract(40.0, "xhand1", joints, still_map(joints), {}, **more)
 
 
 def test_it_follows_the_reported_joints_whatever_their_order_and_feels_the_ball() -> None:

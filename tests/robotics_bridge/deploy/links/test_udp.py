@@ -35,7 +35,7 @@ from robotics_bridge.deploy.links.udp import (
     read_key,
 )
 from robotics_bridge.deploy.safety import Command, SafeLink, SafetyLimits
-from robotics_bridge.policies.contract import PolicyContract
+from robotics_bridge.policies.contract import PolicyContract, TrainedMap
 
 JOINTS, FINGERS, KEY = ("a", "b"), ("thumb",), new_key()
 
@@ -87,8 +87,8 @@ def _until(condition, seconds: float = 1.2) -> None:
 
 def _contract(joints, default, low) -> PolicyContract:
     values = {"default": default, "scale": 1.0, "low": low, "high": 1.0}
-    actions = {name: (value,) * len(joints) for name, value in values.items()}
-    return PolicyContract({"proprio": (3 * len(joints),)}, 40.0, "hand", joints, joints, actions, {})
+    actions = TrainedMap(joints, **{name: (value,) * len(joints) for name, value in values.items()})
+    return PolicyContract(40.0, "hand", joints, actions, {}, inputs={"proprio": (3 * len(joints),)})
 
 
 def _control(driver, seconds=0.6, **limits):
