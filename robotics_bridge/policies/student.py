@@ -18,7 +18,14 @@ import torch
 from torch import nn
 
 from brainbench.core.errors import UsageError, check_name
-from robotics_bridge.policies.encoders.arms import EncoderConfig, FeatureNorm, Stepped, TactileEncoder, elu_perceptron
+from robotics_bridge.policies.encoders.arms import (
+    EncoderConfig,
+    FeatureNorm,
+    Stepped,
+    TactileEncoder,
+    elu_perceptron,
+    recur,
+)
 
 _LEAST = 1e-2  # added to the deviations, as rsl_rl does
 
@@ -117,16 +124,13 @@ class GroupEncoder(nn.Module):
         """Return (embeddings [L, B, …], h_out) of L steps [L, B, n]; memory is forgotten where ``ended`` [L, B]."""
         if self.cell is None:
             return self.net(x), h_in
-        hidden, memory = h_in.chunk(2, 1)
-        states = []
-        for step, each in enumerate(x):
-            # Memory may be forgotten between any two steps; what has none follows as one batch.
-            hidden, memory = self.cell(each, (hidden, memory))
-            states.append(hidden)
-            if ended is not None:
-                gone = ended[step][:, None]
-                hidden, memory = torch.where(gone, 0.0, hidden), torch.where(gone, 0.0, memory)
-        return self.net(torch.stack(states)), torch.cat((hidden, memory), 1)
+        # Memory may be forgotten between any two steps; what has none follows as one batch.
+        hidden, h_out = recur(self._remember, x, h_in, ended)
+        return self.net(hidden), h_out
+
+    def _remember(self, x: torch.Tensor, state: torch.Tensor) -> Stepped:
+        hidden, memory = self.cell(x, state.chunk(2, 1))  # type: ignore[misc]
+        return hidden, torch.cat((hidden, memory), 1)
 
 
 class PolicyCore(nn.Module):
@@ -138,32 +142,26 @@ class PolicyCore(nn.Module):
         self.embedders = nn.ModuleList(GroupEncoder(size, embedder) for size in sizes.values())
         self.tactile: TactileEncoder | None = tactile
         self.splits: list[int] = [*(int(part.state_size) for part in self.embedders)]  # type: ignore[arg-type]
-        self.splits.append(tactile.state_size if tactile is not None else 0)
         # Runtimes know no empty arrays, so a policy without memory carries one number that stays zero.
-        self.splits.append(0 if sum(self.splits) else 1)
-        self.state_size: int = sum(self.splits)
+        self.stored_size: int = sum(self.splits) or 1
+        """Numbers of memory per row where a frozen encoder's features are stored, so that it needs none here."""
+        self.state_size: int = sum(self.splits) + (tactile.state_size if tactile is not None else 0) or 1
         """H."""
         self.features: int = sum(int(part.features) for part in self.embedders)  # type: ignore[arg-type]
         self.features += tactile.features if tactile is not None else 0
         self.precision: torch.dtype | None = None
         """Precision of the tactile encoder while :meth:`unroll` runs (mixed); None for that of its weights."""
 
-    @property
-    def stored_size(self) -> int:
-        """Numbers of memory per row where a frozen encoder's features are stored, so that it needs none here."""
-        return sum(self.splits[:-2]) or 1
-
     def unroll(
         self, flat: Sequence[torch.Tensor], taxels: torch.Tensor | None, h_in: torch.Tensor,
-        ended: torch.Tensor | None = None, *, stored: bool = False,
+        ended: torch.Tensor | None = None,
     ) -> Stepped:  # fmt: skip
         """Return (latents [L, B, D], h_out) of normalised flat groups [L, B, n] and readings [L, B, S, N, C].
 
-        With ``stored``, ``taxels`` are features [L, B, F] and the memory has ``stored_size``. It is forgotten after a
-        step where ``ended`` [L, B]; None for nowhere.
+        For readings a frozen encoder takes its stored features [L, B, F] too; the memory may then have ``stored_size``.
+        It is forgotten after a step where ``ended`` [L, B]; None for nowhere.
         """
-        sizes = [*self.splits[:-2], h_in.shape[1] - sum(self.splits[:-2])] if stored else self.splits
-        states = list(h_in.split(sizes, 1))
+        states = list(h_in.split([*self.splits, h_in.shape[1] - sum(self.splits)], 1))
         parts = []
         for index, (embed, x) in enumerate(zip(self.embedders, flat, strict=True)):
             y, states[index] = embed.unroll(x, states[index], ended)  # type: ignore[operator]
@@ -171,10 +169,7 @@ class PolicyCore(nn.Module):
         if self.tactile is not None and taxels is not None:
             mixed = self.precision is not None
             with torch.autocast(taxels.device.type, self.precision, cache_enabled=False) if mixed else nullcontext():
-                if stored:
-                    y = self.tactile.embed(taxels)
-                else:
-                    y, states[-2] = self.tactile.unroll(taxels, states[-2], ended)
+                y, states[-1] = self.tactile.unroll(taxels, states[-1], ended)
             parts.append(y.float() if mixed else y)
         return torch.cat(parts, -1), torch.cat([state.to(h_in.dtype) for state in states], 1)
 
@@ -241,27 +236,21 @@ class TactilePolicy(MLPModel):
             shapes[TACTILE] = self.core.tactile.shape
         return shapes
 
-    def advance(self, obs: Any, h_in: torch.Tensor, features: torch.Tensor | None = None) -> Stepped:
+    def advance(self, obs: Any, h_in: torch.Tensor) -> Stepped:
         """Return (latent [B, D], h_out [B, H]) of one step; :meth:`unroll` without L, not remembered in the model."""
-        read = self.shapes if features is None else self.obs_groups
-        stored = None if features is None else features[None]
-        latents, h_out = self.unroll({name: obs[name][None] for name in read}, h_in, None, stored)
+        latents, h_out = self.unroll({name: obs[name][None] for name in self.shapes}, h_in)
         return latents[0], h_out
 
-    def unroll(
-        self, obs: Any, h_in: torch.Tensor, ended: torch.Tensor | None = None, features: torch.Tensor | None = None
-    ) -> Stepped:
+    def unroll(self, obs: Any, h_in: torch.Tensor, ended: torch.Tensor | None = None) -> Stepped:
         """Return (latents [L, B, D], h_out [B, H]) of groups [L, B, …] from a memory of zeros before the first step.
 
-        It starts anew after a step where ``ended`` [L, B]. With ``features`` [L, B, F] of the frozen encoder instead of
-        its readings, the memory is [B, ``core.stored_size``].
+        It starts anew after a step where ``ended`` [L, B]. With features [L, B, F] of the frozen encoder as touch, in
+        place of its readings, the memory is [B, ``core.stored_size``].
         """
         flat: list[torch.Tensor] = []
         if self.obs_groups:
             joined = torch.cat([obs[name] for name in self.obs_groups], -1)
             flat = list(self.obs_normalizer(joined).split(self._sizes, -1))
-        if features is not None:
-            return self.core.unroll(flat, features, h_in, ended, stored=True)
         return self.core.unroll(flat, obs[TACTILE] if self.core.tactile is not None else None, h_in, ended)
 
     def action_of(self, latent: torch.Tensor) -> torch.Tensor:
@@ -322,8 +311,10 @@ class TactilePolicy(MLPModel):
             normaliser.update(flat)
             # rsl_rl puts a new tensor there, which a recorded graph would not see.
             normaliser._std = deviation.copy_(normaliser._std)
-        if self.core.tactile is not None and TACTILE in obs.keys():  # noqa: SIM118 - a TensorDict has no other "in"
-            self.core.tactile.observe_scale(obs[TACTILE].reshape(-1, 1, *self.core.tactile.shape))
+        touch = self.core.tactile
+        # A frozen encoder has no scale to learn, and its features may stand in place of readings.
+        if touch is not None and touch.frozen_part is None and TACTILE in obs.keys():  # noqa: SIM118 - a TensorDict
+            touch.observe_scale(obs[TACTILE].reshape(-1, 1, *touch.shape))
         for norm in self._norms:
             norm.settle()
 

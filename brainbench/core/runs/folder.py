@@ -210,15 +210,6 @@ def restore_learner(
             raise DataError(f"{brief(name)} of the optimiser in {brief(os.fspath(path))} fits no weights. {RESTART}")
 
 
-def odd_shape(
-    given: Mapping[str, torch.Tensor], expected: Mapping[str, torch.Tensor]
-) -> tuple[str, tuple[int, ...] | None, tuple[int, ...] | None] | None:
-    """Return the first name whose shape differs, with both shapes (None where it is missing); None if all agree."""
-    theirs, ours = ({name: tuple(value.shape) for name, value in tree.items()} for tree in (given, expected))
-    names = (name for name in {**ours, **theirs} if ours.get(name) != theirs.get(name))
-    return next(((name, theirs.get(name), ours.get(name)) for name in names), None)
-
-
 class Stop:
     """Says when to stop: ``seconds`` after it was made, at a ``count`` of what is ``counted``, or on SIGTERM."""
 

@@ -305,6 +305,20 @@ def elu_perceptron(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Seque
     return nn.Sequential(*layers, nn.Linear(sizes[-1], outputs))
 
 
+def recur(step: Callable[..., Stepped], x: torch.Tensor, state: torch.Tensor, ended: torch.Tensor | None) -> Stepped:
+    """Return what a step (x, state) → (y, state) gives of inputs x [L, B, …], and the state [B, H] after the last.
+
+    The state is forgotten after a step where ``ended`` [L, B]; None for nowhere.
+    """
+    outputs = []
+    for index, each in enumerate(x):
+        y, state = step(each, state)
+        outputs.append(y)
+        if ended is not None:
+            state = torch.where(ended[index][:, None], 0.0, state)
+    return torch.stack(outputs), state
+
+
 class TactileEncoder(nn.Module):
     """Base of all arms; the configuration fixes :attr:`shape` and the state."""
 
@@ -330,22 +344,15 @@ class TactileEncoder(nn.Module):
 
         The memory is forgotten after a step where ``ended`` [L, B]; None for nowhere.
         """
-        embeddings = []
-        for step, reading in enumerate(taxels):
-            y, h_in = self(reading, h_in)
-            embeddings.append(y)
-            if ended is not None:
-                h_in = torch.where(ended[step][:, None], 0.0, h_in)
-        return torch.stack(embeddings), h_in
+        return recur(self, taxels, h_in, ended)
 
     @property
     def frozen_part(self) -> FrontEnd | None:
-        """The part without gradients, whose features can be computed once and kept; None if there is none."""
-        return None
+        """The part without gradients, None without one; :meth:`unroll` takes its features [L, B, F] for readings too.
 
-    def embed(self, features: torch.Tensor) -> torch.Tensor:
-        """Return the embedding [B, F] of what :attr:`frozen_part` gave."""
-        raise NotImplementedError
+        So they can be computed once and kept.
+        """
+        return None
 
     def observe_scale(self, taxels: torch.Tensor) -> None:
         """Take readings [T, B, S, N, C] into account in the scale of the input."""
@@ -545,12 +552,14 @@ class _Network(TactileEncoder):
     def frozen_part(self) -> FrontEnd | None:
         return self.front if self.config.learning == "frozen" else None
 
-    def embed(self, features: torch.Tensor) -> torch.Tensor:
-        return self.project(self.norm(features))
+    def unroll(self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None) -> Stepped:
+        if taxels.ndim == 3:
+            return self.project(self.norm(taxels)), h_in
+        return super().unroll(taxels, h_in, ended)
 
     def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         features, h_out = self.front(taxels, h_in)
-        return self.embed(features), h_out
+        return self.project(self.norm(features)), h_out
 
 
 class _Reservoir(TactileEncoder):

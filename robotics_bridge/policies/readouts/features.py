@@ -19,7 +19,7 @@ from brainbench.models.graph.temporal_graph import TemporalGraph
 from brainbench.models.registry import locate_model
 from robotics_bridge.envs.env import Env
 from robotics_bridge.hands.observations import TAXELS_IN_CONTACT
-from robotics_bridge.policies.encoders.arms import EchoState
+from robotics_bridge.policies.encoders.arms import EchoState, recur
 from robotics_bridge.policies.encoders.taxel_grid import FrontEnd, HandCalibration, TaxelGraph, TaxelGrid, Time
 from robotics_bridge.policies.evaluate import Acting, forget
 from robotics_bridge.sensors.noise.model import PRESETS
@@ -48,6 +48,11 @@ class TouchRollout:
     """[T, B, L, 7] of the tactile links in the palm's frame (m, quaternion)."""
     floor: float = 0.0
     """Largest reading of a taxel that touches nothing (N, N·m)."""
+
+    @property
+    def ended(self) -> torch.Tensor:
+        """[T, B] bool: last step of an episode."""
+        return self.begun.roll(-1, 0)
 
     @property
     def wanted(self) -> torch.Tensor:
@@ -198,11 +203,7 @@ def network(
     options = {"unroll": "full"} if graph else {}
     front = FrontEnd(model, grid, time=time, calibration=calibration, seed=seed, options=options)
     front = front.to(rollout.taxels.device)
-    state, answers = front.init_state(rollout.taxels.shape[1]), []
-    for reading, first in zip(rollout.taxels, rollout.begun, strict=True):
-        features, state = front(reading, torch.where(first[:, None], 0.0, state))
-        answers.append(features)
-    return torch.stack(answers)
+    return recur(front, rollout.taxels, front.init_state(rollout.taxels.shape[1]), rollout.ended)[0]
 
 
 def reservoir(
@@ -214,11 +215,7 @@ def reservoir(
     felt = (grid.wrenches(rollout.taxels.flatten(0, 1)).cpu() / torch.tensor(unit)).flatten(2, -2).mT.flatten(1)
     echo = EchoState(felt.shape[1], seed=seed)
     drive = echo.drive(felt).unflatten(0, rollout.taxels.shape[:2])
-    state, states = drive.new_zeros(drive.shape[1:]), []
-    for now, first in zip(drive, rollout.begun.cpu(), strict=True):
-        state = echo(now, torch.where(first[:, None], 0.0, state))
-        states.append(state)
-    return torch.stack(states)
+    return recur(lambda u, x: (echo(u, x),) * 2, drive, drive.new_zeros(drive.shape[1:]), rollout.ended.cpu())[0]
 
 
 @dataclass(frozen=True)

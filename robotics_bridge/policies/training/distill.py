@@ -41,13 +41,13 @@ from brainbench.core.runs.folder import (
     learner_state,
     load_state,
     occupied,
-    odd_shape,
     random_state,
     restore_learner,
     save_state,
     set_random_state,
 )
 from brainbench.core.runs.log import RunLog
+from brainbench.models.ops.layers import load_named
 from robotics_bridge.envs.step import JOINTS
 from robotics_bridge.hands.layouts import check_probes, is_probe_file
 from robotics_bridge.policies.contract import Groups, check_hand, check_version, from_json, shapes_of, world_of
@@ -85,13 +85,8 @@ def begin_with(student: TactilePolicy, start: str | Path) -> None:
     path = policy_path("student", start) / MODEL
     with readable(path, "student", "It is damaged, or of another student."):
         weights = read_tensors(path, "file of weights (safetensors)")
-    if odd := odd_shape(weights, student.state_dict()):
-        name, theirs, mine = odd
-        raise DataError(
-            f"The student {str(start)!r} has {name!r} of shape {theirs}, here {mine}: start from one that feels and "
-            "acts alike."
-        )
-    student.load_state_dict(weights)
+    what = f"the student here, which starts from {str(start)!r} and not from one that feels and acts alike"
+    load_named(student.state_dict(), weights, what=what)
 
 
 def origins_of(config: DistillConfig) -> dict[str, str]:
@@ -152,8 +147,8 @@ def _require_sizes(path: Path, config: DistillConfig, shapes: Mapping[str, tuple
 Tensors = dict[str, torch.Tensor]
 Rollout = Tensors
 """T control steps of B environments by name [T, B, …]: observation groups that the student or its decoders read;
-``features`` [F] of a frozen encoder in place of the readings; actions [A] of ``teacher`` and ``student``; ``ended``: an
-episode did after the step. ``memory`` is the student's [B, H] before the first step."""
+touch as features [F] of a frozen encoder in place of its readings; actions [A] of ``teacher`` and ``student``;
+``ended``: an episode did after the step. ``memory`` is the student's [B, H] before the first step."""
 
 
 class ChunkStep:
@@ -340,19 +335,16 @@ class _Run:
         steps, rollout = self.config.steps_per_env, {"memory": self.memory.clone()}
         rollout["ended"] = torch.empty(steps, len(self.memory), dtype=torch.bool, device=self.device)
         targets = [head.target for head in self.decoders]
-        recorded = [name for name in (*self.groups, *targets) if self.front is None or name != TACTILE]
         self.student.eval()
         for step in range(steps):
-            obs, features = self.observations, None
-            row = {name: obs[name] for name in recorded}
+            obs = self.observations
+            row = {name: obs[name] for name in (*self.groups, *targets)}
             if self.front is not None:
                 with torch.autocast(self.device.type, self.precision, enabled=self.precision is not None):
                     features, self.touched = self.front(obs[TACTILE], self.touched)
-                features, self.touched = features.float(), self.touched.float()
-                row["features"] = features
-            now = {name: obs[name][None] for name in self.groups}
-            latent, memory = self.student.unroll(now, self.memory, None, None if features is None else features[None])
-            action = self.student.action_of(latent[0]).float()
+                row[TACTILE], self.touched = features.float(), self.touched.float()
+            latent, memory = self.student.advance(row, self.memory)
+            action = self.student.action_of(latent).float()
             right = self.teacher(obs).float()
             # Ross et al. 2011: the student's own states are visited, a share of actions being the teacher's, and the
             # teacher labels them all.
@@ -405,7 +397,7 @@ class _Run:
 
     def _loss(self, given: Mapping[str, torch.Tensor]) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
         """Return the parts of the loss of a chunk and the memory after it."""
-        latent, memory = self.student.unroll(given, given["memory"], given["ended"], given.get("features"))
+        latent, memory = self.student.unroll(given, given["memory"], given["ended"])
         parts = {"behaviour": self._behaviour(self.student.action_of(latent), given)}
         for head in self.decoders:
             # Auxiliary decoders read the latent: their losses shape it, and nothing of them remains in the policy.
@@ -476,7 +468,9 @@ class _Run:
         self.memory, self.touched = (state[name].to(self.device) for name in ("memory", "touched"))
         for number in state["rollouts"]:
             stored = load_file(self.out / "rollouts" / f"{number}.safetensors")
-            self.rollouts[number] = {name: value.to(self.device) for name, value in stored.items()}
+            # Earlier versions stored the features of a frozen encoder by a name of their own.
+            names = {name: TACTILE if name == "features" else name for name in stored}
+            self.rollouts[number] = {names[name]: value.to(self.device) for name, value in stored.items()}
         set_random_state(state["random"], self.device)
 
 

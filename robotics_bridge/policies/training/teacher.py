@@ -21,7 +21,7 @@ from typing import Annotated, Any, cast
 
 import torch
 
-from brainbench.core.errors import BrainbenchError, DataError, UsageError, brief, check_name, needing
+from brainbench.core.errors import DataError, UsageError, brief, check_name, needing
 from brainbench.core.files import file_hash, provenance, read_json, read_mapping, to_plain, write_json, write_tensors
 from brainbench.core.limits import Count, Limit, NotNegative, Positive, Seed, limited
 from brainbench.core.progress import Progress, track
@@ -35,12 +35,12 @@ from brainbench.core.runs.folder import (
     claim,
     load_state,
     occupied,
-    odd_shape,
     random_state,
     save_state,
     set_random_state,
 )
 from brainbench.core.runs.log import RunLog, check_sinks
+from brainbench.models.ops.layers import load_named
 from robotics_bridge import tasks
 from robotics_bridge.envs.env import Env, RslRlEnv
 from robotics_bridge.policies.contract import check_fit, check_version, from_json, with_contacts_of, world_of
@@ -402,16 +402,8 @@ class Trainer:
                 "folder of brainbench policy train, one of its model_<iteration>.safetensors, or a shipped teacher."
             )
         for name, tree in parts.items():
-            trees = (tree, state[f"{name}_state_dict"])
-            if odd := odd_shape(*trees):
-                key, theirs, mine = odd
-                raise DataError(
-                    f"The {name} of {str(file)!r} does not fit: {key!r} has the shape {theirs}, here {mine}. Take a "
-                    "run of a task with the same observations, actions and layers."
-                )
-            state[f"{name}_state_dict"] = tree
-        wanted = {"actor": True, "critic": True, "optimizer": False, "iteration": False, "rnd": False}
-        self.algorithm.load(state, wanted, strict=True)
+            what = f"the {name} here, whose observations, actions or layers are not those of {brief(str(file))}"
+            load_named(state[f"{name}_state_dict"], tree, what=what)
         if std is not None:
             spread: Any = self.algorithm.get_policy().distribution
             log = spread.std_type == "log"
@@ -571,8 +563,7 @@ def load_teacher(run: str | Path, env: Env) -> Policy:
     The run is a folder, one of its ``model_<iteration>.safetensors``, or a name of
     :func:`~robotics_bridge.policies.shipped.list_policies`.
     """
-    path = Path(run)
-    file = model_file(path)
+    file = model_file(run)
     facts = read_mapping(file.parent / "config.json", "configuration of a teacher")
     check_fit(facts, env, str(run))
     hidden = from_json(TeacherSettings, facts.get("settings"), "settings of config.json").hidden
@@ -582,19 +573,13 @@ def load_teacher(run: str | Path, env: Env) -> Policy:
     biases = [weights.get(f"mlp.{2 * layer}.bias") for layer in range(len(hidden))]
     if [list(getattr(bias, "shape", ())) for bias in biases] != [[width] for width in hidden]:
         raise DataError(f"The weights in {str(file)!r} are of another policy than config.json describes.")
-    try:
-        # Who only acts finds random numbers and episodes as they were.
-        with torch.random.fork_rng(devices=[]):
-            actor = ActingModel(env.observations, env.task.groups, "actor", env.num_actions, hidden)
-        actor.load_state_dict({name: value for name, value in weights.items() if not name.startswith("distribution.")})
-    except BrainbenchError:
-        raise
-    except (RuntimeError, TypeError, ValueError, LookupError, AttributeError) as error:
-        task, hand = (str(facts.get(name))[:80] for name in ("task", "hand"))
-        raise DataError(
-            f"The policy of {str(path)!r} was trained on {task!r} with hand {hand!r} and does not "
-            f"fit this environment ({env.task.name!r}, {env.hand.name!r})."
-        ) from error
+    # Who only acts finds random numbers and episodes as they were.
+    with torch.random.fork_rng(devices=[]):
+        actor = ActingModel(env.observations, env.task.groups, "actor", env.num_actions, hidden)
+    weights = {name: value for name, value in weights.items() if not name.startswith("distribution.")}
+    task, mine = str(facts.get("task"))[:80], env.task.name
+    with readable(file, "teacher", "It is damaged, or of another policy."):
+        load_named(actor.state_dict(), weights, what=f"a policy of the task {mine!r} ({str(run)!r} learned {task!r})")
     return Policy(actor.to(env.device))
 
 

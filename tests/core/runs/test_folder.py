@@ -18,7 +18,6 @@ from brainbench.core.runs.folder import (
     load_state,
     mark,
     occupied,
-    odd_shape,
     random_state,
     restore_learner,
     save_state,
@@ -117,13 +116,6 @@ def test_a_state_of_another_format_is_refused_in_one_sentence(tmp_path):
     save_file({"learner.weight": torch.zeros(2)}, tmp_path / "state.safetensors", {"state": json.dumps({"plain": {}})})
     with pytest.raises(DataError, match=r"state\.safetensors.*Delete it to start anew"):
         load_state(tmp_path / "state.safetensors")
-
-
-def test_the_first_odd_shape_is_named():
-    same = {"a": torch.zeros(2)}
-    assert odd_shape(same, same) is None
-    assert odd_shape(same, {"a": torch.zeros(3)}) == ("a", (2,), (3,))
-    assert odd_shape(same, {**same, "b": torch.zeros(3)}) == ("b", None, (3,))
 
 
 def test_a_run_stops_after_its_time_or_at_its_count():

@@ -92,7 +92,7 @@ def test_kept_features_of_a_frozen_network_give_the_same_latent() -> None:
     for step in range(5):
         latent, h = policy.advance(obs[step], h)
         features, own = front(obs[step]["tactile"], own)
-        kept, _ = policy.advance(obs[step], policy.zeros(2), features)
+        kept, _ = policy.advance({**obs[step], "tactile": features}, policy.zeros(2))
         torch.testing.assert_close(latent, kept)
 
 
@@ -138,7 +138,7 @@ def test_what_a_frozen_network_gave_needs_no_memory_of_touch() -> None:
             given, own = front(obs[step]["tactile"], own)
             features.append(given)
         whole, _ = policy.unroll(obs, policy.zeros(2))
-        kept, after = policy.unroll(obs, policy.zeros(2, stored=True), None, torch.stack(features))
+        kept, after = policy.unroll({**obs, "tactile": torch.stack(features)}, policy.zeros(2, stored=True))
     assert after.shape == (2, policy.core.stored_size)
     torch.testing.assert_close(kept, whole, atol=1e-5, rtol=1e-4)
 

@@ -148,7 +148,7 @@ def test_a_run_may_begin_with_the_networks_of_another(tmp_path: Path) -> None:
     assert result.iterations == 1
     config = json.loads((tmp_path / "second" / "config.json").read_text())
     assert config["start"]["file"].endswith("first/model_2.safetensors")
-    with pytest.raises(DataError, match=r"'mlp\.0\.weight' .*\(16, .*\(32"):
+    with pytest.raises(DataError, match=r"'mlp\.0\.weight' .*\[16, .*\[32"):
         Trainer(env, replace(settings, hidden=(32, 16))).begin_from(tmp_path / "first")
 
 
@@ -246,7 +246,7 @@ def test_a_policy_of_another_task_is_refused(tmp_path: Path) -> None:
     described = json.loads((tmp_path / "config.json").read_text())
     del described["action_map"]
     (tmp_path / "config.json").write_text(json.dumps(described))
-    with pytest.raises(DataError, match=r"'in_palm_rotate' .*'in_hand_repose'"):
+    with pytest.raises(DataError, match=r"'in_hand_repose' .*'in_palm_rotate'"):
         load_teacher(tmp_path, other)
     with pytest.raises(DataError, match=r"/nothing' .*model_"):
         newest(tmp_path / "nothing")
