@@ -120,17 +120,6 @@ class ResNet18Encoder(nn.Module):
             self.add_module(f"layer{index}", blocks)
         self.fc = nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Flatten(), Linear(self.features, self.features))
 
-    def multiply_adds(self) -> int:
-        """Return the multiply-adds of one step of one stimulus."""
-        total, (_, rows, columns) = self.features**2, self.input_shape
-        # The first convolution halves the grid, its pool too, and every layer from the second on: a stride of 2 with
-        # "same"-like padding of an odd kernel rounds up.
-        for name, times in (("conv1", 1), ("layer1", 2), ("layer2", 3), ("layer3", 4), ("layer4", 5)):
-            places = -(-rows // 2**times) * -(-columns // 2**times)
-            layer = self.get_submodule(name)
-            total += sum(m.weight.numel() for m in layer.modules() if isinstance(m, Conv2d)) * places
-        return total
-
     def forward(self, x: torch.Tensor, *, return_activations: bool | Collection[str] = False) -> Any:
         """Return the features [B, T, F], with activations also ``{layer: [B, T, ...]}``."""
         check_sweep(x, self.input_shape, "The ResNet")
@@ -210,12 +199,6 @@ class S4Encoder(nn.Module):
         self.embed = Linear(math.prod(self.input_shape), self.features, gain=RECTIFIER_GAIN)
         self.blocks: Any = nn.ModuleList(S4Block(self.features, dropout) for _ in range(len(self.layers) - 2))
         self.fc = Linear(self.features, self.features)
-
-    def multiply_adds(self) -> int:
-        """Return the multiply-adds of one streamed step: linear layers, and 12 per conjugate pair of the recurrence."""
-        # For each pair: 4 for the transition, 2 each for row, column, input and readout.
-        linear = sum(module.weight.numel() for module in self.modules() if isinstance(module, Linear))
-        return linear + sum(12 * block.memory.frequency.numel() for block in self.blocks)
 
     def forward(self, x: torch.Tensor, *, return_activations: bool | Collection[str] = False) -> Any:
         """Return the features [B, T, F], with activations also ``{layer: [B, T, width]}``."""
@@ -333,15 +316,6 @@ class GPTAttender(nn.Module):
     def max_steps(self) -> int:
         """Longest sweep that fits the context."""
         return self.context // 2
-
-    def multiply_adds(self) -> int:
-        """Return the multiply-adds of the first step: two tokens through the blocks, one through the head.
-
-        Every earlier token adds 4 × width per block to the attention of a later step.
-        """
-        linear = sum(module.weight.numel() for module in self.modules() if isinstance(module, Linear))
-        attention = len(self.blocks) * 2 * 2 * 2 * self.features
-        return 2 * linear - self.lm_head.weight.numel() + attention
 
     def init_state(self, batch: int) -> GPTState:
         """Return the state before the first step: no tokens."""
@@ -505,10 +479,6 @@ class MambaAttender(nn.Module):
         self.blocks: Any = nn.ModuleList(MambaBlock(features, depth=blocks, **sizes) for _ in range(blocks))
         self.norm = nn.LayerNorm(features)
         self.layers: tuple[str, ...] = (*(f"block{index}" for index in range(1, blocks + 1)), "norm")
-
-    def multiply_adds(self) -> int:
-        """Return the multiply-adds of products and convolutions in one step (the recurrences add about 3 %)."""
-        return sum(m.weight.numel() for m in self.modules() if isinstance(m, (Linear, nn.Conv1d)))
 
     def forward(self, x: torch.Tensor, *, return_activations: bool | Collection[str] = False) -> Any:
         """Return the answers [B, T, F], with activations also ``{layer: [B, T, F]}``."""

@@ -17,7 +17,7 @@ from brainbench.core.contracts import CHANNELS, SUB_STEP_SECONDS, SUB_STEPS
 from brainbench.core.errors import UsageError, check_each, check_number
 from brainbench.models.graph.spec import Unroll
 from brainbench.models.graph.temporal_graph import TemporalGraph
-from brainbench.models.parts import AllStepsDecoder, Attender, Encoder, make_decoder
+from brainbench.models.parts import AllStepsDecoder, Attender, Encoder, make_decoder, multiply_adds
 
 FORCE_SCALE = 1e-4  # N that become 1: the order of a whisker's base force in contact
 MOMENT_SCALE = 1e-6  # N·m that become 1
@@ -199,12 +199,7 @@ class EncoderAttenderDecoder(nn.Module):
 
     def multiply_adds(self) -> int:
         """Return the multiply-adds of matrix products and convolutions in the first time step of one stimulus."""
-        attender = self.attender.multiply_adds() if self.attender is not None else 0
-        decoder = sum(module.weight.numel() for module in self.decoder.modules() if isinstance(module, nn.Linear))
-        if isinstance(self.decoder, AllStepsDecoder):  # each step meets its own part of the first layer alone
-            first = self.decoder.first.weight.numel()
-            decoder -= first - first // self.decoder.steps
-        return self.encoder.multiply_adds() + attender + decoder
+        return multiply_adds(self, *self.spec.input_shape)
 
     def init_state(self, batch: int) -> NetworkState:
         """Return the state before the first step of so many sweeps; UsageError where that is no whole number."""

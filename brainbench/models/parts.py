@@ -16,10 +16,13 @@ from typing import Any, Protocol
 import torch
 from torch import nn
 from torch.nn import functional
+from torch.nn.attention import SDPBackend, sdpa_kernel
+from torch.utils.flop_counter import FlopCounterMode
 
 from brainbench.core.contracts import GRID_SHAPE
 from brainbench.core.errors import UsageError, check_name, check_number
 from brainbench.models.ops.layers import RECTIFIER_GAIN, Linear, perceptron
+from brainbench.models.ops.state_space import StateSpace
 
 
 class Part(Protocol):
@@ -31,10 +34,6 @@ class Part(Protocol):
     @property
     def features(self) -> int:
         """Number of features of one answer."""
-        ...
-
-    def multiply_adds(self) -> int:
-        """Return the multiply-adds of matrix products and convolutions in the first step of one stimulus."""
         ...
 
     def init_state(self, batch: int) -> Any:
@@ -76,6 +75,24 @@ class Attender(Part, Protocol):
     def max_steps(self) -> int | None:
         """Longest sweep it can read; None: any."""
         ...
+
+
+def multiply_adds(part: Any, *shape: int) -> int:
+    """Return the multiply-adds of matrix products, convolutions and state spaces in the first step of one stimulus.
+
+    ``shape`` is that of a step [B, *shape]. The weights may lie on the device ``meta``.
+    """
+    from brainbench.models.activations import evaluating
+
+    counter = FlopCounterMode(display=False)
+    # PyTorch does not count its fused attention on the CPU; two stimuli, since one alone has kernels of its own.
+    with evaluating(part), torch.no_grad(), sdpa_kernel(SDPBackend.MATH), counter:
+        part.step(next(part.parameters()).new_zeros(2, *shape), part.init_state(2))
+    # Streamed number by number, short convolutions and state spaces are not counted: of each conjugate pair 4 for the
+    # transition, 2 each for row, column, input and readout.
+    streamed = sum(module.weight.numel() for module in part.modules() if isinstance(module, nn.Conv1d))
+    streamed += sum(12 * module.frequency.numel() for module in part.modules() if isinstance(module, StateSpace))
+    return counter.get_total_flops() // 4 + streamed  # a multiply-add is two FLOPs
 
 
 def run_layers(

@@ -62,16 +62,14 @@ class PaperHand:
         pass
 
 
-ACTIONS = TrainedMap(("a", "c"), default=(0.1, 0.2), scale=(0.5, 0.5), low=(-1.0, 0.0), high=(1.0, 0.4))
-
-
 def still_map(joints: tuple[str, ...]) -> TrainedMap:
     """Return a map under which actions of zero leave joints at zero."""
     return TrainedMap(joints, *((number,) * len(joints) for number in (0.0, 1.0, -1.0, 1.0)))
 
 
 def make_contract(groups=("proprio",), rate=40.0) -> PolicyContract:
-    return PolicyContract(rate, "paper", JOINTS, ACTIONS, {"b": 0.3}, inputs=dict.fromkeys(groups, (1,)))
+    actions = TrainedMap(("a", "c"), default=(0.1, 0.2), scale=(0.5, 0.5), low=(-1.0, 0.0), high=(1.0, 0.4))
+    return PolicyContract(rate, "paper", JOINTS, actions, {"b": 0.3}, inputs=dict.fromkeys(groups, (1,)))
 
 
 def make_limits(**changes) -> SafetyLimits:

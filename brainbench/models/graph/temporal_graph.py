@@ -42,7 +42,7 @@ from brainbench.models.graph.tnn_import import read_graph
 from brainbench.models.ops import dispatch
 from brainbench.models.ops.dispatch import DeferredNormGrad, DeferredWeightGrad
 from brainbench.models.ops.layers import RECTIFIER_GAIN, Conv2d, Linear, activation, check_named, copy_named
-from brainbench.models.parts import wanted
+from brainbench.models.parts import multiply_adds, wanted
 
 # Bilinear with antialiasing: a smaller grid averages what lies between its places instead of skipping it.
 _RESIZED: dict[str, Any] = {"mode": "bilinear", "align_corners": False, "antialias": True}
@@ -279,19 +279,7 @@ class TemporalGraph(nn.Module):
 
     def multiply_adds(self) -> int:
         """Return the multiply-adds of matrix products and convolutions in one step of one stimulus."""
-        total = 0
-        for name, node in self.named_nodes():
-            # A dense layer has no grid left: the product over it is one.
-            places = math.prod(self.memory_grid(name))
-            if isinstance(node.operation, (Conv2d, Linear)):
-                # A convolution uses each weight once at every place of its output.
-                total += node.operation.weight.numel() * places
-            if node.memory is not None:
-                total += sum(m.weight.numel() for m in node.memory.modules() if isinstance(m, Conv2d)) * places
-            for step, shape in zip(node.steps, node.node.stages((1, *node.grid))[2:], strict=True):
-                weights = sum(m.weight.numel() for m in step.modules() if isinstance(m, (Conv2d, Linear)))
-                total += weights * math.prod(shape[1:])
-        return total
+        return multiply_adds(self, *self.input_shape)
 
     def init_state(self, batch: int) -> GraphState:
         """Return the state before the first step: silent nodes and empty memories, all zeros."""

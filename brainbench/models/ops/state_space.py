@@ -107,8 +107,8 @@ class StateSpace(nn.Module):
         super().__init__()
         poles, low_rank, drive = _legs(pairs)
         low, high = map(math.log, step_range)
-        self.log_decay = nn.Parameter(torch.from_numpy(np.log(-np.real(poles))).float().repeat(channels, 1))
-        self.frequency = nn.Parameter(torch.from_numpy(np.imag(poles)).float().repeat(channels, 1))
+        self.log_decay = nn.Parameter(torch.tensor(np.log(-np.real(poles))).float().repeat(channels, 1))
+        self.frequency = nn.Parameter(torch.tensor(np.imag(poles)).float().repeat(channels, 1))
         self.low_rank = nn.Parameter(_parts(low_rank, channels))
         self.drive = nn.Parameter(_parts(drive, channels))
         self.readout = nn.Parameter(torch.empty(channels, pairs, 2))
@@ -220,7 +220,7 @@ def _real_product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 
 def _parts(values: NDArray[Any], channels: int) -> torch.Tensor:
-    return torch.view_as_real(torch.from_numpy(values).to(torch.complex64)).repeat(channels, 1, 1)
+    return torch.view_as_real(torch.tensor(values).to(torch.complex64)).repeat(channels, 1, 1)
 
 
 def _legs(pairs: int) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
