@@ -1,9 +1,7 @@
-"""The parts of an encoder-attender-decoder network: their protocols, decoders, and heads of self-supervised objectives.
+"""The parts of an encoder-attender-decoder network: their protocols, and decoders.
 
 A part is a :class:`torch.nn.Module` whose streaming state is a value that only the part itself looks into. A decoder
-takes the features of one step [..., F], or of all steps so far. Heads of self-supervised objectives are trained with
-the network and left behind afterwards; their sizes are the published ones at 512 features: SimCLR 1,315,072
-parameters, SimSiam 11,556,352, autoencoder 289,665.
+takes the features of one step [..., F], or of all steps so far.
 
 Letters: B batch, T time step, (C, H, W) one step of the stimulus, F features.
 """
@@ -19,7 +17,6 @@ from torch.nn import functional
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
-from brainbench.core.contracts import GRID_SHAPE
 from brainbench.core.errors import UsageError, check_name, check_number
 from brainbench.models.ops.layers import RECTIFIER_GAIN, Linear, perceptron
 from brainbench.models.ops.state_space import StateSpace
@@ -188,50 +185,3 @@ def make_decoder(name: str, features: int, classes: int = CLASSES) -> nn.Module:
     check_name("decoder", name, DECODERS)
     check_number("The number of classes of a decoder", classes, least=2, whole=True)
     return DECODERS[name](features, classes)
-
-
-HIDDEN = 2048
-
-
-class SimCLRHead(nn.Module):
-    """Projection [B, F] → [B, 128]: F → 2048 → 128 with batch norms, linear layers without bias (Chen et al. 2020)."""
-
-    def __init__(self, features: int) -> None:
-        super().__init__()
-        self.layers = perceptron(features, HIDDEN, 128, norms=2, use_bias=False)
-
-    def forward(self, features: torch.Tensor) -> torch.Tensor:
-        """Return the embeddings [B, 128], not normalised."""
-        return self.layers(features)
-
-
-class SimSiamHead(nn.Module):
-    """Projector F → 2048 → 2048 → 2048 and predictor 2048 → 512 → 2048 (Chen & He 2021)."""
-
-    def __init__(self, features: int) -> None:
-        super().__init__()
-        self.projector = perceptron(features, HIDDEN, HIDDEN, HIDDEN, norms=3)
-        self.predictor = perceptron(HIDDEN, 512, HIDDEN, norms=1)
-
-    def forward(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the projection and its prediction [B, 2048]."""
-        projection = self.projector(features)
-        return projection, self.predictor(projection)
-
-
-class AutoencoderHead(nn.Module):
-    """Reconstruction [B, T, F] → [B, T, C, H, W]: a linear layer to C/2 channels, three transposed convolutions."""
-
-    def __init__(self, features: int, *, channels: int = 30, grid: tuple[int, int] = GRID_SHAPE) -> None:
-        super().__init__()
-        check_number("The number of channels of an autoencoder", channels, least=2, whole=True)
-        self.shape = (channels // 2, *grid)
-        self.dense = Linear(features, channels // 2 * grid[0] * grid[1], gain=RECTIFIER_GAIN)
-        self.layers = nn.Sequential()
-        for width in (channels // 2, channels, channels):
-            self.layers.extend((nn.ReLU(), nn.ConvTranspose2d(width, channels, 3, padding=1)))
-
-    def forward(self, features: torch.Tensor) -> torch.Tensor:
-        """Return the reconstruction [B, T, C, H, W] of every step, in normalised units."""
-        hidden = self.dense(features.flatten(0, -2)).unflatten(-1, self.shape)
-        return self.layers(hidden).unflatten(0, features.shape[:-1])

@@ -194,17 +194,23 @@ class ModelRecord(ModelFacts):
 
 
 @dataclass(frozen=True)
-class ModelDescription(ModelFacts):
-    """Record of an architecture with its size and cost, known without building its weights."""
+class ModelSize:
+    """Size and cost of a network."""
 
-    source: str
-    """Top-level package that the code comes from."""
     parameters: int
     multiply_adds: int | None
     """Multiply-adds of a time step, counted on the first one (attention to earlier steps adds under 0.2 % to
     the 22nd of ``+gpt``); None for a model without a method ``multiply_adds``."""
     layers: tuple[str, ...]
     """Layers that can be extracted by name."""
+
+
+@dataclass(frozen=True)
+class ModelDescription(ModelSize, ModelFacts):
+    """Record of an architecture with its size and cost, known without building its weights."""
+
+    source: str
+    """Top-level package that the code comes from."""
     trained: Mapping[str, Any] | None = None
     """For a name of trained weights: what their configuration says."""
 
@@ -363,15 +369,6 @@ def describe_model(name: str) -> ModelDescription:
     label = record.name if located.trained is None else name
     facts = {field.name: getattr(record, field.name) for field in fields(ModelFacts)} | {"name": label}
     return ModelDescription(**facts, **asdict(size), source=record.source, trained=located.trained)
-
-
-@dataclass(frozen=True)
-class ModelSize:
-    """Size and cost of a network, as :class:`ModelDescription` states them."""
-
-    parameters: int
-    multiply_adds: int | None
-    layers: tuple[str, ...]
 
 
 def measure(located: LocatedModel) -> ModelSize:

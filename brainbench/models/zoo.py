@@ -91,33 +91,23 @@ def build(
 
 
 def _encoder(architecture: Architecture) -> Encoder:
-    if architecture.encoder == "resnet18":
-        from brainbench.models.encoders import ResNet18Encoder
-
-        return ResNet18Encoder(small=architecture.small)
-    if architecture.encoder == "s4":
-        from brainbench.models.encoders import S4Encoder
-
-        return S4Encoder(small=architecture.small)
-    from brainbench.models.encoders import zhuang_graph
+    from brainbench.models.encoders import ResNet18Encoder, S4Encoder, zhuang_graph
     from brainbench.models.graph.temporal_graph import TemporalGraph
 
-    if architecture.cell == "feedforward":
-        return TemporalGraph(zhuang_graph(small=architecture.small, feedforward=True))
-    return TemporalGraph(zhuang_graph(architecture.cell or "time-decay", architecture.layer_norm, architecture.small))
+    small, feedforward = architecture.small, architecture.cell == "feedforward"
+    if architecture.encoder != "zhuang":
+        return {"resnet18": ResNet18Encoder, "s4": S4Encoder}[architecture.encoder](small=small)
+    cell = "time-decay" if feedforward else architecture.cell or "time-decay"
+    return TemporalGraph(zhuang_graph(cell, architecture.layer_norm, small, feedforward=feedforward))
 
 
 def _attender(architecture: Architecture, features: int) -> Attender | None:
-    if architecture.attender == "gpt":
-        from brainbench.models.encoders import GPTAttender
+    from brainbench.models.encoders import GPTAttender, MambaAttender
 
+    if architecture.attender == "gpt":
         # As published, the ResNet's transformer is half as wide as its features.
         return GPTAttender(features, features // 2 if architecture.encoder == "resnet18" else features)
-    if architecture.attender == "mamba":
-        from brainbench.models.encoders import MambaAttender
-
-        return MambaAttender(features)
-    return None
+    return MambaAttender(features) if architecture.attender == "mamba" else None
 
 
 def architectures() -> Iterator[Architecture]:

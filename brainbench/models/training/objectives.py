@@ -21,11 +21,10 @@ from torch.nn import functional
 from torch.optim import Optimizer
 
 from brainbench.core.devices import record_step
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, check_number
 from brainbench.models.cells import Cell, GatedCell
 from brainbench.models.encoders import BasicBlock, GPTBlock, MambaBlock, S4Block
-from brainbench.models.ops.layers import copy_named
-from brainbench.models.parts import AutoencoderHead, SimCLRHead, SimSiamHead
+from brainbench.models.ops.layers import RECTIFIER_GAIN, Linear, copy_named, perceptron
 
 TEMPERATURE = 0.1
 RECONSTRUCTION_WEIGHT = 0.5
@@ -72,6 +71,9 @@ def autoencoder_loss(reconstruction: torch.Tensor, target: torch.Tensor, latent:
 class Learner(nn.Module):
     """A network [B, T, C, H, W] in SI → [B, classes] with its objective's head: (views, labels [B]) → loss [].
 
+    Heads are left behind after training; their sizes are the published ones at 512 features: SimCLR 1,315,072
+    parameters, SimSiam 11,556,352, autoencoder 289,665.
+
     Self-supervised objectives need a network with ``encode``, ``features`` and ``normaliser``, as
     :class:`~brainbench.models.network.EncoderAttenderDecoder` has them.
     """
@@ -91,6 +93,7 @@ class Learner(nn.Module):
         if not self.supervised and hasattr(model, "decoder"):
             # The decoder has no part in it and is fitted afterwards, by the linear probe.
             self.model.decoder.requires_grad_(False)
+        self.head = nn.ModuleDict()
 
 
 class Supervised(Learner):
@@ -103,49 +106,71 @@ class Supervised(Learner):
         return functional.cross_entropy(self.model(views[0]).float(), labels)
 
 
+HIDDEN = 2048  # width of projections
+
+
 class SimCLR(Learner):
-    """Contrast of two views at the last step's features."""
+    """Contrast of two views at the last step's features, projected F → 2048 → 128 (Chen et al. 2020).
+
+    The projection has batch norms, and linear layers without bias.
+    """
 
     views = 2
 
     def __init__(self, model: nn.Module) -> None:
         super().__init__(model)
-        self.head = SimCLRHead(self.model.features)
+        self.head["layers"] = perceptron(self.model.features, HIDDEN, 128, norms=2, use_bias=False)
 
     def forward(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor) -> torch.Tensor:
         """Return the loss; labels have no part in it."""
         del labels
-        return nt_xent(*self.head(self.model.encode(torch.cat(views), last=True)).chunk(2))
+        return nt_xent(*self.head["layers"](self.model.encode(torch.cat(views), last=True)).chunk(2))
 
 
 class SimSiam(Learner):
-    """Prediction of one view's projection from the other's."""
+    """Prediction of one view's projection from the other's (Chen & He 2021).
+
+    Projector F → 2048 → 2048 → 2048 and predictor 2048 → 512 → 2048.
+    """
 
     views = 2
 
     def __init__(self, model: nn.Module) -> None:
         super().__init__(model)
-        self.head = SimSiamHead(self.model.features)
+        self.head["projector"] = perceptron(self.model.features, HIDDEN, HIDDEN, HIDDEN, norms=3)
+        self.head["predictor"] = perceptron(HIDDEN, 512, HIDDEN, norms=1)
 
     def forward(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor) -> torch.Tensor:
         """Return the loss; labels have no part in it."""
         del labels
         first, second = self.model.encode(torch.cat(views), last=True).chunk(2)
         # The head sees one view at a time, so its batch norms never mix the statistics of both.
-        (z1, p1), (z2, p2) = self.head(first), self.head(second)
+        p1 = self.head["predictor"](z1 := self.head["projector"](first))
+        p2 = self.head["predictor"](z2 := self.head["projector"](second))
         return simsiam_loss(p1, z1, p2, z2)
 
 
 class Autoencoding(Learner):
     """Reconstruction of every step of the stimulus, in normalised units, from the features.
 
-    Features know a step only after the encoder's latency, so those of step t + latency reconstruct step t.
+    Features know a step only after the encoder's latency, so those of step t + latency reconstruct step t: a linear
+    layer to C/2 channels, and three transposed convolutions.
     """
 
     def __init__(self, model: nn.Module) -> None:
         super().__init__(model)
         channels, *grid = self.model.spec.input_shape
-        self.head = AutoencoderHead(self.model.features, channels=channels, grid=(grid[0], grid[1]))
+        check_number("The number of channels of an autoencoder", channels, least=2, whole=True)
+        self.shape = (channels // 2, *grid)
+        self.head["dense"] = Linear(self.model.features, math.prod(self.shape), gain=RECTIFIER_GAIN)
+        self.head["layers"] = layers = nn.Sequential()
+        for width in (channels // 2, channels, channels):
+            layers.extend((nn.ReLU(), nn.ConvTranspose2d(width, channels, 3, padding=1)))
+
+    def reconstruct(self, features: torch.Tensor) -> torch.Tensor:
+        """Return every step [B, T, C, H, W], in normalised units, from its features [B, T, F]."""
+        hidden = self.head["dense"](features.flatten(0, -2)).unflatten(-1, self.shape)
+        return self.head["layers"](hidden).unflatten(0, features.shape[:-1])
 
     def forward(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor) -> torch.Tensor:
         """Return the loss; labels have no part in it."""
@@ -158,7 +183,7 @@ class Autoencoding(Learner):
             )
         latent = self.model.encode(x)[:, latency:]
         target = self.model.normaliser(x[:, : x.shape[1] - latency])
-        return autoencoder_loss(self.head(latent), target, latent)
+        return autoencoder_loss(self.reconstruct(latent), target, latent)
 
 
 LEARNERS = {"supervised": Supervised, "simclr": SimCLR, "simsiam": SimSiam, "ae": Autoencoding}

@@ -194,18 +194,6 @@ def bits(rollout: TouchRollout, links: Sequence[int]) -> Features:
     return torch.stack(parts, -1).float().flatten(2)
 
 
-def network(
-    rollout: TouchRollout, grid: TaxelGrid, calibration: HandCalibration, *, model: str, time: Time, seed: int
-) -> Features:
-    """Return the features of a network that steps through the rollout, its memory forgotten where episodes begin."""
-    # Networks answer at once here; only temporal graphs add latency.
-    graph = isinstance(getattr(locate_model(model).outline(), "encoder", None), TemporalGraph)
-    options = {"unroll": "full"} if graph else {}
-    front = FrontEnd(model, grid, time=time, calibration=calibration, seed=seed, options=options)
-    front = front.to(rollout.taxels.device)
-    return recur(front, rollout.taxels, front.init_state(rollout.taxels.shape[1]), rollout.ended)[0]
-
-
 def reservoir(
     rollout: TouchRollout, grid: TaxelGrid | TaxelGraph, calibration: HandCalibration, *, seed: int
 ) -> Features:
@@ -238,9 +226,18 @@ class Subject:
 
 
 def networks(time: Time, name: str, subject: Subject, seeds: Sequence[int] = (0,)) -> list[Features]:
-    """Return the features of a network, once for each seed of weights that are drawn."""
-    parts = (subject.rollout, subject.grid, subject.calibration)
-    return [network(*parts, model=name, time=time, seed=seed) for seed in seeds]
+    """Return the features of a network, once for each seed of weights that are drawn.
+
+    It steps through the rollout, its memory forgotten where episodes begin.
+    """
+    taxels, features = subject.rollout.taxels, []
+    # Networks answer at once here; only temporal graphs add latency.
+    graph = isinstance(getattr(locate_model(name).outline(), "encoder", None), TemporalGraph)
+    how = {"time": time, "calibration": subject.calibration, "options": {"unroll": "full"} if graph else {}}
+    for seed in seeds:
+        front = FrontEnd(name, subject.grid, seed=seed, **how).to(taxels.device)
+        features.append(recur(front, taxels, front.init_state(taxels.shape[1]), subject.rollout.ended)[0])
+    return features
 
 
 def mapped(rollout: TouchRollout, grid: TaxelGrid | TaxelGraph) -> Features:

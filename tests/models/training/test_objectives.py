@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 from contextlib import nullcontext
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -111,6 +112,40 @@ def test_the_autoencoder_compares_features_with_the_step_they_can_know():
     assert learner.model.spec.latency == 3
     with pytest.raises(UsageError, match="3 steps; received 3"):
         learner(*_batch(learner, steps=3))
+
+
+class _Named(nn.Module):
+    """A network of which only the sizes count."""
+
+    encode = normaliser = None
+
+    def __init__(self, features, channels=30):
+        super().__init__()
+        self.features, self.spec = features, SimpleNamespace(input_shape=(channels, 5, 7))
+
+
+@pytest.mark.parametrize(("objective", "parameters"), [("simclr", 1_315_072), ("simsiam", 11_556_352), ("ae", 289_665)])
+def test_heads_have_the_published_parameters(objective, parameters):
+    with torch.device("meta"):
+        learner = make_learner(objective, _Named(512))
+    assert sum(parameter.numel() for parameter in learner.parameters()) == parameters
+
+
+def test_heads_have_the_published_shapes():
+    features = torch.randn(4, 96)
+    assert make_learner("simclr", _Named(96)).head["layers"](features).shape == (4, 128)
+    siamese = make_learner("simsiam", _Named(96)).head
+    assert (found := siamese["projector"](features)).shape == siamese["predictor"](found).shape == (4, 2048)
+    assert make_learner("ae", _Named(96)).reconstruct(features.view(2, 2, 96)).shape == (2, 2, 30, 5, 7)
+    with pytest.raises(UsageError, match=r"channels .*received 1"):
+        make_learner("ae", _Named(96, channels=1))
+
+
+def test_steps_are_reconstructed_each_from_its_own_features():
+    learner, features = make_learner("ae", _Named(8)), torch.randn(2, 3, 8)
+    with torch.no_grad():
+        every = learner.reconstruct(features)
+        torch.testing.assert_close(every[:, 1], learner.reconstruct(features[:, 1:2])[:, 0])
 
 
 def test_a_plain_network_can_only_be_trained_supervised():
