@@ -233,11 +233,16 @@ class IntersectionRNN(GatedCell):
         """Return (y, state), both [B, out, H, W]."""
         state = self._check(x, state)
         fused = self._fused(self.conv, x, state, projected)
-        return dispatch.apply_gates(self, fused, x, state, projected=bool(projected))
+        # In the deferring pass of a convolution the gates' kernels write its gradient, so they run there too.
+        if self.deferred is not None or (not projected and dispatch.kernel_applies(self.conv, x)):
+            places: Any = None if self.deferred is None else (self.deferred, self.conv.deferred)
+            return dispatch.fused_gates(fused, x, state, self.gate_norms, places)
+        return self.apply_gates(fused, x, state)
 
-    def norm(self, gate: str) -> ChannelNorm:
-        """Return the norm of a gate."""
-        return cast(ChannelNorm, self.norms[gate])
+    @property
+    def gate_norms(self) -> list[ChannelNorm]:
+        """Norms of the gates in their order; none without layer norm."""
+        return [cast(ChannelNorm, self.norms[gate]) for gate in self.gates] if self.norms else []
 
     def apply_gates(self, fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor) -> CellStep:
         """Return (y, state), both [B, out, H, W], from the gates' pre-activations."""

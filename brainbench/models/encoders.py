@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple, cast
 
@@ -225,17 +224,8 @@ class S4Encoder(nn.Module):
 _TOKEN_STD = 0.02
 
 
-@dataclass(frozen=True)
-class GPTState:
-    """Keys and values of the tokens so far, one pair [B, heads, tokens, width/heads] per block."""
-
-    keys: tuple[torch.Tensor, ...]
-    values: tuple[torch.Tensor, ...]
-
-    @property
-    def tokens(self) -> int:
-        """Number of tokens seen."""
-        return self.keys[0].shape[2]
+GPTState = tuple[tuple[torch.Tensor, torch.Tensor], ...]
+"""Keys and values of the tokens so far, one pair [B, heads, tokens, width/heads] per block."""
 
 
 class GPTBlock(nn.Module):
@@ -320,18 +310,16 @@ class GPTAttender(nn.Module):
     def init_state(self, batch: int) -> GPTState:
         """Return the state before the first step: no tokens."""
         heads = self.blocks[0].heads
-        empty = (self.positions.new_zeros(batch, heads, 0, self.features // heads),) * len(self.blocks)
-        return GPTState(empty, empty)
+        empty = self.positions.new_zeros(batch, heads, 0, self.features // heads)
+        return ((empty, empty),) * len(self.blocks)
 
     def step(self, x: torch.Tensor, state: GPTState) -> tuple[torch.Tensor, GPTState]:
         """Advance by one step of features [B, F]; return the answer [B, width] and the next state."""
-        stream = self.tokens(x[:, None], state.tokens)
-        keys, values = [], []
-        for block, *past in zip(self.blocks, state.keys, state.values, strict=True):
-            stream, (key, value) = block(stream, past)
-            keys.append(key)
-            values.append(value)
-        return self.lm_head(self.norm(stream[:, 1])), GPTState(tuple(keys), tuple(values))
+        stream, after = self.tokens(x[:, None], state[0][0].shape[2]), []
+        for block, past in zip(self.blocks, state, strict=True):
+            stream, pair = block(stream, past)
+            after.append(pair)
+        return self.lm_head(self.norm(stream[:, 1])), tuple(after)
 
     def forward(self, x: torch.Tensor, *, return_activations: bool | Collection[str] = False) -> Any:
         """Return the answers [B, T, width], with activations also those at the action tokens of named layers."""

@@ -11,6 +11,7 @@ Letters: B batch, S numbers of state.
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import io
 import logging
@@ -28,12 +29,14 @@ from torch import nn
 from torch.nn import functional
 
 from brainbench.core.errors import DataError, UsageError, brief, check_name, check_number, needing
+from brainbench.core.files import atomic_path, provenance, write_json
 from brainbench.core.reading.apart import CRASHED, SECONDS, call_apart
 from brainbench.core.reading.regular import check_file, reason, temporary_folder
 from brainbench.core.reading.tensors import check_finite
 from brainbench.models.encoders import GPTAttender, MambaAttender, MambaMemory, S4Encoder
 from brainbench.models.graph.temporal_graph import GraphState, TemporalGraph
 from brainbench.models.network import EncoderAttenderDecoder
+from brainbench.models.ops.layers import weights_hash
 from brainbench.models.ops.state_space import System
 
 _Tensors = list[torch.Tensor]
@@ -259,11 +262,6 @@ def export_model(model: nn.Module, path: str | Path, *, format: str = "onnx", na
     The network is exported in evaluation mode, on the CPU, as ``onnx`` or ``torch``; the suffix of the format is added
     to a path without one. ``name`` is what the contract calls the network.
     """
-    import copy
-
-    from brainbench.core.files import atomic_path, provenance, write_json
-    from brainbench.models.ops.layers import weights_hash
-
     check_name("export format", format, SUFFIXES)
     target = Path(path)
     target = target if target.suffix else target.with_suffix(SUFFIXES[format])

@@ -15,11 +15,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from brainbench.core.errors import DataError, brief, listing, repeats
+from brainbench.core.files import create_hdf5
+from brainbench.core.lazy import lazy_module
 from brainbench.core.reading.hdf5 import open_hdf5
 
 if TYPE_CHECKING:
     import h5py
     from numpy.typing import NDArray
+else:
+    h5py = lazy_module("h5py")
 
 
 @dataclass(frozen=True)
@@ -33,10 +37,6 @@ class Features:
 
 def write_features(path: str | Path, labels: Sequence[str], activations: Mapping[str, NDArray[np.floating]]) -> Path:
     """Write activations ([K, F] or [K, T, F] per layer) in the layout above, atomically."""
-    import h5py
-
-    from brainbench.core.files import create_hdf5
-
     for layer, values in activations.items():
         _check_shape(layer, np.shape(values), len(labels), str(path))
     with create_hdf5(path) as file:
@@ -51,8 +51,6 @@ def write_features(path: str | Path, labels: Sequence[str], activations: Mapping
 
 def read_features(path: str | Path) -> Features:
     """Read a file in the layout above."""
-    import h5py
-
     path = Path(path)
     with open_hdf5(path, "file of activations") as file:
         labels, group = file.get("labels"), file.get("activations")
@@ -96,8 +94,6 @@ def _layers(group: h5py.Group, rows: int, path: str) -> dict[str, NDArray[np.flo
 
 def _arrays(group: h5py.Group, path: str, prefix: str = "") -> Iterator[tuple[str, h5py.Dataset]]:
     """Yield the arrays of a group and of those in it, by their paths in it."""
-    import h5py
-
     if prefix.count("/") > 32:
         raise DataError(f"{brief(path)} nests its layers more than 32 deep, or in a circle.")
     for name, node in group.items():

@@ -33,13 +33,21 @@ from brainbench.core.files import (
     settings_dir,
     write_json,
 )
+from brainbench.core.lazy import lazy_module
 from brainbench.core.plugins import files_of, foreign_code, load_entry_points, load_object
 from brainbench.core.reading.regular import user_path
 from brainbench.models.recipes import OBJECTIVES, Architecture, check_new_name
 from brainbench.models.training.checkpoints import PREFIXES, WEIGHTS, find_folder, load_weights, read_config, shipped
 
 if TYPE_CHECKING:
+    import torch
     from torch import nn
+
+    from brainbench.models import proof
+    from brainbench.models.ops import layers
+else:
+    torch, nn = lazy_module("torch"), lazy_module("torch.nn")
+    proof, layers = lazy_module("brainbench.models.proof"), lazy_module("brainbench.models.ops.layers")
 
 FAMILY = "user module"  # family of models whose code is not in the registry of a package; boards set them apart
 _LOG = logging.getLogger(__name__)
@@ -83,16 +91,12 @@ def load_user_model(target: str, *, seed: int = 0) -> nn.Module:
     ``name`` is a class or function without required arguments, or a ready module. The file's own folder
     can be imported from while it loads. Random weights follow from the seed (CPU generator).
     """
-    from brainbench.models.ops.layers import seeded
-
-    with seeded(seed):
+    with layers.seeded(seed):
         return build_user_model(target).eval()
 
 
 def build_user_model(target: str, **options: Any) -> nn.Module:
     """Build a model from its code with the random state as it is; see :func:`load_user_model`."""
-    from torch import nn
-
     builder = load_object(target, "model")
     if callable(builder) and not isinstance(builder, nn.Module):
         given = f"with {', '.join(options)}" if options else "without arguments"
@@ -103,8 +107,6 @@ def build_user_model(target: str, **options: Any) -> nn.Module:
 
 def check_module(module: Any, target: str) -> nn.Module:
     """Return what a user's or another package's code made, which must be a module."""
-    from torch import nn
-
     if not isinstance(module, nn.Module):
         raise UsageError(f"{target!r} gave a {type(module).__name__}, not a torch.nn.Module; return the model itself.")
     return module
@@ -299,12 +301,8 @@ class LocatedModel:
             return self._drawn(0, {})
 
     def _drawn(self, seed: int, options: Mapping[str, Any], device: str = "cpu") -> nn.Module:
-        import torch
-
-        from brainbench.models.ops.layers import seeded
-
         # A program's own default device would draw other numbers.
-        with seeded(seed), torch.device(device):
+        with layers.seeded(seed), torch.device(device):
             return self._make(options)
 
     def _make(self, options: Mapping[str, Any]) -> nn.Module:
@@ -373,12 +371,10 @@ def describe_model(name: str) -> ModelDescription:
 
 def measure(located: LocatedModel) -> ModelSize:
     """Count a network's parameters and multiply-adds."""
-    from brainbench.models.proof import named_layers
-
     model = located.outline()
     count: Callable[[], int] | None = getattr(model, "multiply_adds", None)
     parameters = sum(parameter.numel() for parameter in model.parameters())
-    return ModelSize(parameters, count() if count is not None else None, named_layers(model) or ())
+    return ModelSize(parameters, count() if count is not None else None, proof.named_layers(model) or ())
 
 
 @functools.cache

@@ -26,7 +26,7 @@ from brainbench.core.files import file_hash
 from brainbench.core.limits import Limit, check_value, limited
 from robotics_bridge import hands
 from robotics_bridge.deploy.driver import Clock, Driver, HandReading, Source
-from robotics_bridge.deploy.safety import Command, SafeLink, SafetyLimits
+from robotics_bridge.deploy.safety import SafeLink, SafetyLimits
 from robotics_bridge.envs.step import VELOCITY
 from robotics_bridge.policies.contract import RATE, PolicyContract
 from robotics_bridge.policies.export import Runner, read_policy
@@ -250,7 +250,7 @@ class Controller:
         moved = zip(self.contract.moved, self.contract.action_map.targets(action).tolist(), strict=True)
         targets, limited = self._limit({**self.contract.frozen, **dict(moved)}, reading)
         # Whatever took its time since the report was read: sources, the policy, or this computer.
-        if (reason := self.link.send(Command(targets, reading, deadline))) is not None:
+        if (reason := self.link.send(targets, reading, deadline)) is not None:
             return reason
         self.latency.append(self.clock() - begun)
         self.processor.append(time.thread_time() - busy)

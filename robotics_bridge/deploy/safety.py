@@ -125,18 +125,6 @@ class ClockOffset:
         return now - stamp - self._least
 
 
-@dataclass(frozen=True, eq=False)
-class Command:
-    """What a hand is asked for, with the report that it was decided from and the time until which it holds."""
-
-    targets: NDArray[np.float64]
-    """[J] (rad)."""
-    reading: HandReading
-    """Carries the time of the report."""
-    deadline: float
-    """Latest time (s, by the link's clock) at which it may be sent (:meth:`SafeLink.deadline`)."""
-
-
 SILENCE = 0.25  # longest time without a command (s) after which the link stops the hand, in a thread of its own
 
 
@@ -168,12 +156,12 @@ class SafeLink:
         """Return the latest time (s) at which a command from a report may be sent."""
         return self._clock() - self._age(reading) + self._limits.timeout
 
-    def send(self, command: Command) -> str | None:
-        """Send a command; return why it was not sent, or None."""
-        targets, limits = command.targets, self._limits
+    def send(self, targets: NDArray[np.float64], reading: HandReading, deadline: float) -> str | None:
+        """Send targets [J] (rad), decided from a report, until their :meth:`deadline` (s); return why not, or None."""
+        limits = self._limits
         if not limits.allows(targets):
             return "a command would be no numbers or beyond the joints' limits"
-        before = command.reading.position if self._before is None else self._before
+        before = reading.position if self._before is None else self._before
         # From outside its range a joint is brought back at once.
         way = np.abs(targets - np.clip(before, limits.low, limits.high)) - limits.speed * self._step
         if (way > 1e-6).any():
@@ -183,15 +171,15 @@ class SafeLink:
                 return self._stopped
             # Measured last: all that happened since the report was read counts, and the hand has moved on meanwhile.
             now, timeout = self._clock(), limits.timeout
-            if not now <= command.deadline:
-                age = now - command.deadline + timeout
+            if not now <= deadline:
+                age = now - deadline + timeout
                 return (
                     f"a command came {1e3 * age:.0f} ms after the report it was decided from (allowed "
                     f"{1e3 * timeout:.0f} ms)"
                 )
             if self._overdue(now):
                 return self._stopped
-            origin: dict[str, Any] = {"report": command.reading, "allowed": timeout} if self._carries else {}
+            origin: dict[str, Any] = {"report": reading, "allowed": timeout} if self._carries else {}
             self._driver.send(targets, **origin)
             self._before, self._due = np.array(targets), now + self._step + SILENCE
         return None

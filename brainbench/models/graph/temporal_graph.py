@@ -479,7 +479,7 @@ class UnrolledSweep:
                 for conv in [part for part in memory.modules() if isinstance(part, Conv2d)]:
                     yield conv, DeferredWeightGrad(conv, grid, stimuli)
             if isinstance(memory, IntersectionRNN):
-                yield memory, DeferredNormGrad([memory.norm(gate) for gate in memory.gates] if memory.norms else [])
+                yield memory, DeferredNormGrad(memory.gate_norms)
 
     def _window(self, source: str, first: int, stop: int) -> torch.Tensor:
         """Return the outputs of a node at steps first to stop [B, stop − first, ...]; before its first step, zeros."""

@@ -30,10 +30,9 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import torch
-from torch import nn
 from torch.autograd.function import once_differentiable
 
 from brainbench.models.ops.layers import ChannelNorm, Conv2d
@@ -265,16 +264,6 @@ def conv_concat(conv: Conv2d, inputs: Sequence[torch.Tensor]) -> torch.Tensor:
     return conv(first if len(inputs) == 1 else torch.cat([first, *(x.to(first.dtype) for x in inputs[1:])], 1))
 
 
-def apply_gates(
-    cell: KernelCell, fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor, *, projected: bool
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return (y, state), both [B, C, H, W], from the gates' pre-activations; ``projected`` ones have no kernel."""
-    # In the deferring pass of a convolution the gates' kernels write its gradient, so they run there too.
-    if cell.deferred is not None or (not projected and kernel_applies(cell.conv, x)):
-        return apply_fused_gates(cell, fused, x, state)
-    return cell.apply_gates(fused, x, state)
-
-
 @contextmanager
 def deferring(given: Iterable[tuple[Any, Any]]) -> Iterator[None]:
     """Give modules a place for deferred gradients each (convolution or cell, its place), and take it away again."""
@@ -334,50 +323,28 @@ class _NormWeights(torch.autograd.Function):
         return None, *(row.to(kind) for row, kind in zip(sums, ctx.kinds, strict=True))
 
 
-class KernelCell(Protocol):
-    """A cell that the kernels can compute: its gates, in the order of its convolution's channels, and their norms."""
-
-    conv: Conv2d
-    norms: nn.ModuleDict
-    deferred: DeferredNormGrad | None
-
-    @property
-    def gates(self) -> tuple[str, ...]:
-        """Names of the gates."""
-        ...
-
-    def norm(self, gate: str) -> ChannelNorm:
-        """Return the norm of a gate."""
-        ...
-
-    def apply_gates(
-        self, fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (y, state) from the gates' pre-activations, by PyTorch."""
-        ...
-
-
-def apply_fused_gates(
-    cell: KernelCell, fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor
+def fused_gates(
+    fused: torch.Tensor,
+    x: torch.Tensor,
+    state: torch.Tensor,
+    norms: Sequence[ChannelNorm],
+    deferred: tuple[DeferredNormGrad, DeferredWeightGrad] | None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return what ``cell.apply_gates`` returns, by fused kernels: (y, state), both [B, C, H, W].
+    """Return (y, state), both [B, C, H, W], from the pre-activations of an intersection cell's gates, by fused kernels.
 
-    In mixed precision the new state is single, otherwise of the precision of the old one.
+    ``norms`` are those of its gates, in the order of its convolution's channels; ``deferred`` are the places for
+    gradients of norms and convolution in a deferring pass. In mixed precision the new state is single, otherwise of the
+    precision of the old one.
     """
     # A memory is added to at every step; in half precision small additions would be lost.
     kind = torch.float32 if torch.is_autocast_enabled(x.device.type) else state.dtype
     state = state.to(kind)
-    if cell.deferred is not None:
-        return _Gates.apply(  # type: ignore[return-value]
-            cell.deferred, cell.conv.deferred, cell.deferred.norms, kind, fused, x, state
-        )
+    if deferred is not None:
+        return _Gates.apply(*deferred, deferred[0].norms, kind, fused, x, state)  # type: ignore[return-value]
     from brainbench.models.ops.kernels import intersection as kernels
 
-    norms = None
-    if cell.norms:
-        chosen = [cell.norm(name) for name in cell.gates]
-        norms = torch.stack((*(norm.weight for norm in chosen), *(norm.bias for norm in chosen)))
-    return kernels.apply_gates(_rows(fused), x, state, norms, kind)
+    weights = torch.stack((*(norm.weight for norm in norms), *(norm.bias for norm in norms))) if norms else None
+    return kernels.apply_gates(_rows(fused), x, state, weights, kind)
 
 
 def _rows(maps: torch.Tensor) -> torch.Tensor:

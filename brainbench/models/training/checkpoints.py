@@ -13,8 +13,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, check_name, listing, needing
+from brainbench.core.files import read_mapping, write_json, write_tensors, write_text
 from brainbench.core.plugins import load_optional
 from brainbench.core.reading.regular import user_path
+from brainbench.core.reading.tensors import read_tensors
 from brainbench.models.recipes import Architecture
 
 if TYPE_CHECKING:
@@ -51,8 +53,6 @@ def save_checkpoint(
     """
     import torch
 
-    from brainbench.core.files import write_json, write_tensors, write_text
-
     check_name("precision of weights", dtype, DTYPES)
     kind = getattr(torch, dtype)
     parameters = {name for name, _ in model.named_parameters()}
@@ -76,8 +76,6 @@ def save_checkpoint(
 
 def read_config(folder: str | os.PathLike[str]) -> dict[str, Any]:
     """Read the configuration of a model's folder."""
-    from brainbench.core.files import read_mapping
-
     path = Path(folder) / CONFIG
     if not path.is_file():
         raise DataFileNotFoundError(
@@ -102,7 +100,6 @@ def read_config(folder: str | os.PathLike[str]) -> dict[str, Any]:
 
 def load_weights(model: nn.Module, path: str | os.PathLike[str], *, what: str) -> None:
     """Load a safetensors file into a model of the same parameters and buffers; all or nothing."""
-    from brainbench.core.reading.tensors import read_tensors
     from brainbench.models.ops.layers import load_named
 
     state = read_tensors(path, f"file of weights for {what!r} (safetensors)")

@@ -12,7 +12,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from brainbench.core.errors import DataError, UsageError, check_each, check_kind, unknown_name
+from brainbench.core.files import read_mapping
 from brainbench.core.limits import Limit, NotNegative, Positive, limited
+from brainbench.core.runs.folder import RUN
+from brainbench.core.runs.log import read_log
 from brainbench.models.recipes import (
     BATCH_SIZE,
     EPOCHS,
@@ -172,10 +175,6 @@ def best_run(out: str | Path) -> tuple[Path, dict[str, float]]:
     Scores are those of the validation data: highest accuracy, or lowest self-supervised loss. The test split has no
     say.
     """
-    from brainbench.core.files import read_mapping
-    from brainbench.core.runs.folder import RUN
-    from brainbench.core.runs.log import read_log
-
     scores: dict[str, float] = {}
     costs: dict[str, float] = {}
     for path in sorted(Path(out).glob(f"*/{RUN}")):

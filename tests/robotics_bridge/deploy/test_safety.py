@@ -26,7 +26,7 @@ import pytest
 from brainbench.core.errors import UsageError
 from robotics_bridge.deploy.controller import Controller, Report
 from robotics_bridge.deploy.driver import Clock
-from robotics_bridge.deploy.safety import SILENCE, ClockOffset, Command, SafeLink, SafetyLimits
+from robotics_bridge.deploy.safety import SILENCE, ClockOffset, SafeLink, SafetyLimits
 from tests.factories.paper_hands import NotingHand, OwnClock, PaperHand, make_contract, make_limits, run_session
 
 
@@ -234,45 +234,45 @@ def _link(clock=None, **changes):
 )  # fmt: skip
 def test_the_link_itself_refuses_what_is_unsafe(targets, words) -> None:
     link, hand, reading, _ = _link()
-    assert words in link.send(Command(np.array(targets), reading, link.deadline(reading)))
+    assert words in link.send(np.array(targets), reading, link.deadline(reading))
     assert hand.sent == []
 
 
 def test_a_command_holds_until_its_deadline_and_a_stop_is_final() -> None:
     link, hand, reading, clock = _link()
-    command = Command(np.zeros(3), reading, link.deadline(reading))
-    assert command.deadline == pytest.approx(clock.now + 0.1)
-    clock.now = command.deadline
-    assert link.send(command) is None
+    deadline = link.deadline(reading)
+    assert deadline == pytest.approx(clock.now + 0.1)
+    clock.now = deadline
+    assert link.send(np.zeros(3), reading, deadline) is None
     clock.now += 1e-6
-    assert "after the report" in link.send(command)
-    assert "no numbers" not in link.send(Command(np.zeros(3), reading, np.nan))
+    assert "after the report" in link.send(np.zeros(3), reading, deadline)
+    assert "no numbers" not in link.send(np.zeros(3), reading, np.nan)
     link.stop()
-    assert link.send(Command(np.zeros(3), reading, clock.now + 1)) == "the hand was stopped"
+    assert link.send(np.zeros(3), reading, clock.now + 1) == "the hand was stopped"
     assert len(hand.sent) == 1
 
 
 def test_the_link_stops_the_hand_while_the_loop_hangs() -> None:
     link, hand, reading, _ = _link(Clock())
     with link.watched():
-        assert link.send(Command(np.zeros(3), reading, link.deadline(reading))) is None
+        assert link.send(np.zeros(3), reading, link.deadline(reading)) is None
         time.sleep(0.1)
         assert hand.stops == 0
         time.sleep(2 * SILENCE)
         assert hand.stops == 1
         reading = link.read()
         assert "no command came for" in link.fault(reading)
-        assert "no command came for" in link.send(Command(np.zeros(3), reading, link.deadline(reading)))
+        assert "no command came for" in link.send(np.zeros(3), reading, link.deadline(reading))
     assert len(hand.sent) == 1
 
 
 def test_a_loop_that_goes_on_before_its_watch_sends_nothing_from_a_fresh_report_either() -> None:
     link, hand, reading, clock = _link()
-    assert link.send(Command(np.zeros(3), reading, link.deadline(reading))) is None
+    assert link.send(np.zeros(3), reading, link.deadline(reading)) is None
     clock.now += SILENCE + 0.03
     reading = link.read()
     assert link.fault(reading) is None
-    assert "no command came for" in link.send(Command(np.zeros(3), reading, link.deadline(reading)))
+    assert "no command came for" in link.send(np.zeros(3), reading, link.deadline(reading))
     assert "no command came for" in link.fault(reading)
     assert len(hand.sent) == 1
 

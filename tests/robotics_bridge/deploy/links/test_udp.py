@@ -34,7 +34,7 @@ from robotics_bridge.deploy.links.udp import (
     pack_values,
     read_key,
 )
-from robotics_bridge.deploy.safety import Command, SafeLink, SafetyLimits
+from robotics_bridge.deploy.safety import SafeLink, SafetyLimits
 from robotics_bridge.policies.contract import PolicyContract, TrainedMap
 
 JOINTS, FINGERS, KEY = ("a", "b"), ("thumb",), new_key()
@@ -436,7 +436,7 @@ def test_a_safe_link_tells_the_hand_what_a_command_comes_from(wire) -> None:
     wire.report()
     link = SafeLink(wire.driver, SafetyLimits(np.full(J, -1.0), np.full(J, 1.0), np.full(J, 9.0)), Clock(), 0.05)
     reading = link.read()
-    assert link.send(Command(reading.position, reading, link.deadline(reading))) is None
+    assert link.send(reading.position, reading, link.deadline(reading)) is None
     wire.pass_on()
     frame = udp.decode(wire.seen[-1], wire.driver._send_key)
     assert frame.origin == (reading.sequence, reading.time + link._limits.timeout)
