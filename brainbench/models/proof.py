@@ -318,19 +318,13 @@ def layer_modules(model: nn.Module) -> dict[str, nn.Module]:
     Parametrisations are weights of the part that they stand in.
     """
     layers: dict[str, nn.Module] = {}
-    passed, ahead = {model}, [(model, "", model.named_children())]
-    while ahead:  # no recursion: a function that names itself would keep the modules alive after it
-        module, prefix, parts = ahead[-1]
-        label, part = next(parts, ("", None))
-        if part is None:
-            ahead.pop()
-        elif part not in passed and not (label == "parametrizations" and is_parametrized(module)):
-            passed.add(part)
-            name = prefix if label == "_orig_mod" else f"{prefix}.{label}".strip(".")
-            leaf = not any(True for _ in part.children())
-            if leaf or is_parametrized(part) or any(True for _ in part.parameters(recurse=False)):
-                layers[name] = part
-            ahead.append((part, name, part.named_children()))
+    within: Any = (part.parametrizations for part in model.modules() if is_parametrized(part))
+    passed = {model, *(part for parametrizations in within for part in parametrizations.modules())}
+    for label, part in model.named_modules():
+        leaf = not any(True for _ in part.children())
+        weighs = is_parametrized(part) or any(True for _ in part.parameters(recurse=False))
+        if part not in passed and (leaf or weighs):
+            layers[".".join(name for name in label.split(".") if name != "_orig_mod")] = part
     return layers
 
 

@@ -37,6 +37,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.sparse.csgraph import laplacian
 from scipy.spatial.distance import cdist
 from torch import nn
@@ -201,20 +202,14 @@ def _lay_sites(axes: FingerAxes, reference: Layout) -> None:
         if not len(mine):
             continue
         steps = np.round(mine[:, 1] / _SAME)
-        values, counts = np.unique(steps, return_counts=True)
+        values, inverse, counts = np.unique(steps, return_inverse=True, return_counts=True)
         # Taxels at one length stay together, so a quantile is that of their middle rank.
         site = np.floor(columns * (np.cumsum(counts) - counts / 2) / counts.sum()).astype(int)
-        for column in range(1, columns):
-            before, after = values[site < column], values[site >= column]
-            # The edge lies half way between the last taxel before it and the first behind, so that rounding parts no
-            # taxels.
-            low = before.max() if len(before) else values.min()
-            high = after.min() if len(after) else np.inf
-            axes.edges[row, column - 1] = _SAME * (low + high) / 2 if len(before) else 0.0
-        for column in range(columns):
-            members = np.isin(steps, values[site == column])
-            if members.any():
-                axes.centers[row, column] = mine[members, 2:].mean(axis=0)
+        # An edge lies half way between the last taxel before it and the first behind, so that rounding parts no taxels.
+        ends, first = np.append(values, np.inf), np.searchsorted(site, np.arange(1, columns))
+        axes.edges[row] = np.where(first > 0, _SAME * (ends[first - 1] + ends[first]) / 2, 0.0)
+        for column in np.unique(site):
+            axes.centers[row, column] = mine[site[inverse] == column, 2:].mean(axis=0)
 
 
 SITES = GRID_SHAPE[0] * GRID_SHAPE[1]  # cells of the grid
@@ -348,21 +343,15 @@ class TaxelGraph(nn.Module):
             observation_type(observe)  # an unknown name has an error of its own
             raise UsageError(f"The graph of taxels reads 'force_torque'; received {observe!r}.")
         points = [probes.position[probes.active] for probes in layout.values()]
-        sizes = [len(one) for one in points]
-        patterns: list[tuple[float, NDArray[Any]]] = []
-        for number, places in enumerate(points):
-            for value, pattern in zip(*_patterns(places), strict=True):
-                whole = [np.zeros(size) for size in sizes]
-                whole[number] = np.sqrt(len(places)) * pattern
-                patterns.append((value, np.concatenate(whole)))
+        values, patterns = zip(*map(_patterns, points), strict=True)
         # Stable: patterns that are equally smooth keep the order of the links.
-        smoothest = sorted(patterns, key=lambda pattern: pattern[0])[:SITES]
+        smoothest = np.argsort(np.concatenate(values), kind="stable")[:SITES]
+        rows = block_diag(*(np.sqrt(len(each)) * each for each in patterns))[smoothest]
         middle = np.concatenate([np.tile(one.mean(0), (len(one), 1)) for one in points if len(one)])
         # Not weights: they follow from the layout, so files of weights need not hold them.
-        rows = [pattern for _, pattern in smoothest]
         self.cells: int = len(rows)
         """K."""
-        self.register_buffer("patterns", torch.tensor(np.array(rows)).float(), persistent=False)
+        self.register_buffer("patterns", torch.from_numpy(rows).float(), persistent=False)
         self.register_buffer("middle", torch.from_numpy(middle).float(), persistent=False)
 
     def wrenches(self, taxels: torch.Tensor) -> torch.Tensor:
@@ -447,15 +436,12 @@ class Resampler(nn.Module):
         oldest = (self.advance - 1) * sub_steps / self.advance + (sub_steps - 1) * self.cycle / self.advance
         remembered = max(int(oldest) + 2, sub_steps)
         self.past = remembered - sub_steps
-        weights = torch.zeros(self.cycle, sub_steps, remembered)
-        for phase in range(self.advance):
-            for sample in range(sub_steps):
-                parts = phase * sub_steps + (sub_steps - 1 - sample) * self.cycle
-                # Times as whole numbers of 1/p readings: no rounding decides which readings a sample lies between.
-                whole, rest = divmod(parts, self.advance)
-                weights[phase, sample, remembered - 1 - whole] += 1 - rest / self.advance
-                if rest:
-                    weights[phase, sample, remembered - 2 - whole] += rest / self.advance
+        # Times before the last reading as whole numbers of 1/p readings: no rounding decides which readings a sample
+        # lies between. Its weights fall to zero over one reading on either side.
+        phase, sample, reading = np.ogrid[: self.cycle, :sub_steps, :remembered]
+        before = phase * sub_steps + (sub_steps - 1 - sample) * self.cycle
+        share = np.clip(self.advance - np.abs(self.advance * (remembered - 1 - reading) - before), 0, None)
+        weights = torch.from_numpy(np.where(phase < self.advance, share / self.advance, 0.0)).float()
         self.register_buffer("weights", weights, persistent=False)
         self.state_size: int = 1 + self.past * values
         """Numbers of state per row: the phase and the readings before."""

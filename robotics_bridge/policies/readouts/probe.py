@@ -57,20 +57,18 @@ class Readout:
 
     def per_draw(self, target: str) -> list[float]:
         """Return R² of each draw."""
-        return [float(value) for value in self._r2(self._of(target, self.errors).sum(1), self._of(target).sum(0))]
+        lost, spread = self._of(target)
+        return (1 - lost.sum(1) / spread.sum(0)).mean(-1).tolist()
 
-    def _of(self, target: str, values: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+    def _of(self, target: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         first = 3 * TARGETS.index(target)
-        return (self.spread if values is None else values)[..., first : first + 3]
-
-    @staticmethod
-    def _r2(lost: NDArray[np.float64], spread: NDArray[np.float64]) -> NDArray[np.float64]:
-        return (1 - lost / spread).mean(-1)
+        return self.errors[..., first : first + 3], self.spread[:, first : first + 3]
 
     def _without_each(self, target: str) -> NDArray[np.float64]:
         """Return R² [B] of all draws without each environment in turn."""
-        lost, spread = self._of(target, self.errors).mean(0), self._of(target)
-        return self._r2(lost.sum(0) - lost, spread.sum(0) - spread)
+        errors, spread = self._of(target)
+        lost = errors.mean(0)
+        return (1 - (lost.sum(0) - lost) / (spread.sum(0) - spread)).mean(-1)
 
     def interval(self, target: str, *, less: Readout | None = None) -> tuple[float, float]:
         """Return the 95 % interval of R², or of the difference from another arm of the same rollout.
