@@ -28,6 +28,7 @@ from brainbench.stimuli.engines.rod.limits import (
     LISTED,
     MESH,
     NOTHING,
+    SAME_PLACE,
     STALE,
     STARTED_INSIDE,
     WARP,
@@ -267,10 +268,10 @@ def candidate_slot(
     slot = count
     # The same contact seen from two links, or from both ends of a short gap.
     for j in range(count):
-        # Normals within 32° and places within a quarter of the link.
+        # Normals within 32°.
         apart = wp.length_sq(row(candidates.point, j) - point)
         same = wp.dot(row(candidates.normal, j), normal) > real(0.85)
-        if same and apart < real(0.0625) * wp.length_sq(link):
+        if same and apart < real(wp.static(SAME_PLACE[smooth] ** 2)) * wp.length_sq(link):
             slot = j
     if wp.static(recorded):
         # By how much one of two links is nearer to what both touch.

@@ -502,6 +502,19 @@ def store_forces(problems: ContactProblems, solver: wp.ref[SolverState], own: wp
     moment = vec3(zero, zero, zero)
     normal_sum = zero
     arc_sum = zero
+    if wp.static(smooth):
+        # Contacts that come of one share its means, by their forces: otherwise it would bend the rod twice.
+        for e in range(warp_max(solver.previous_contacts)):
+            shares = zero
+            for k in range(solver.own_count):
+                if solver.thread + k < solver.contacts and row(own.origin, k) == e:
+                    shares = shares + row(own.force, 3 * k) + real(1e-6)
+            shares = group_sum(shares)
+            for k in range(solver.own_count):
+                if solver.thread + k < solver.contacts and row(own.origin, k) == e:
+                    part = (row(own.force, 3 * k) + real(1e-6)) / shares
+                    own.mean[k] = row(own.mean, k) * part
+                    own.steady[k] = row(own.steady, k) * part
     for k in range(solver.own_count):
         if solver.thread + k < solver.contacts and solver.live == 1:
             force_k = contact_force(own, k)
