@@ -88,9 +88,6 @@ deeper ones are undone over several steps, without a blow."""
 UNDONE = 0.3
 """Speed (mm/ms) at which an overlap of the bent rod is undone at most. Where the line between the joints jumps, what a
 step undoes at once would be a blow that grows as the step shrinks."""
-SAME_PLACE = 1 / 4, 1 / 10
-"""Shares of a link within which two of its places with one normal count as the same contact, of straight links and of
-the bent rod: a contact that lies beyond a joint which bends much holds the soft link behind it, one before does not."""
 
 
 def contacts_for(capacity: int) -> int:

@@ -134,6 +134,41 @@ def test_a_whisker_that_cannot_be_trusted_says_why():
     assert len(found) > 1
 
 
+DEEP = ("pyramid-0", 0, "C3"), ("chair-0", 1, "D1"), ("bottle-0", 0, "C2")
+"""Whiskers that lay .25 to .5 mm deep: across edges between two faces, and where one contact becomes two."""
+
+
+def test_whiskers_beside_edges_and_where_contacts_part_do_not_sink_into_an_object():
+    objects = resolve_objects(["procedural-24:1"], surfaces=True)
+    loaders = {name: item.load for name, item in objects.items() if name in {owner for owner, *_ in DEEP}}
+    scenes = SweepScenes(GRIDS["thesis-high"], loaders, whiskers="C2,C3,D1")
+    launcher, names = SweepLauncher(scenes, Fidelity.preset("fast")), scenes.array.names
+    for owner, place, whisker in DEEP:
+        result = launcher.launch([(owner, scenes.grid.sweeps(owner)[place : place + 1])])
+        depth = result.depth[0, names.index(whisker)]
+        assert result.counts["touching"][0, names.index(whisker)] > 0
+        assert depth < 1.2e-4, (owner, whisker, depth)
+
+
+@pytest.mark.slow
+def test_what_jumps_between_joints_makes_no_blow_that_grows_as_steps_shrink():
+    objects = resolve_objects(["house-0"], surfaces=True)
+    scenes = SweepScenes(GRIDS["thesis-high"], {name: item.load for name, item in objects.items()}, whiskers="C2")
+    launcher = SweepLauncher(scenes, Fidelity.preset("fast"))
+    tries = [(np.ones((1, 1), dtype=bool), divisor) for divisor in (1, 5)]
+    result = launcher.launch([("house-0", scenes.grid.sweeps("house-0")[3:4])], tries)
+    usual, finer = np.linalg.norm(result.wrench[:, :, 0, :3], axis=-1).max(axis=1)
+    assert usual > 0
+    # It was four times the force.
+    assert finer < 1.2 * usual
+
+
+def test_sweeps_touch_the_bent_rod_unless_links_are_asked_for():
+    scenes = _few_sweeps()
+    lines = [SweepLauncher(scenes, replace(COARSE, contact_line=line)).solver.smooth for line in (None, "rod", "links")]
+    assert lines == [True, True, False]
+
+
 def _few_sweeps(**grid):
     objects = resolve_objects(["ellipsoid-1"], surfaces=True)
     grid = SweepGrid(**{"speed": (0.05,), "rotation": (0.0,), "distance": (0.005,), "size": (0.03,), **grid})

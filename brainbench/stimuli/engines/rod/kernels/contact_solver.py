@@ -503,18 +503,17 @@ def store_forces(problems: ContactProblems, solver: wp.ref[SolverState], own: wp
     normal_sum = zero
     arc_sum = zero
     if wp.static(smooth):
-        # Contacts that come of one share its means, by their forces: otherwise it would bend the rod twice.
+        # Contacts that come of one share its means: otherwise it would bend the rod twice.
         for e in range(warp_max(solver.previous_contacts)):
-            shares = zero
+            heirs = zero
             for k in range(solver.own_count):
                 if solver.thread + k < solver.contacts and row(own.origin, k) == e:
-                    shares = shares + row(own.force, 3 * k) + real(1e-6)
-            shares = group_sum(shares)
+                    heirs = heirs + real(1.0)
+            heirs = group_sum(heirs)
             for k in range(solver.own_count):
                 if solver.thread + k < solver.contacts and row(own.origin, k) == e:
-                    part = (row(own.force, 3 * k) + real(1e-6)) / shares
-                    own.mean[k] = row(own.mean, k) * part
-                    own.steady[k] = row(own.steady, k) * part
+                    own.mean[k] = row(own.mean, k) / heirs
+                    own.steady[k] = row(own.steady, k) / heirs
     for k in range(solver.own_count):
         if solver.thread + k < solver.contacts and solver.live == 1:
             force_k = contact_force(own, k)

@@ -151,11 +151,14 @@ def add_contact(problems: ContactProblems, solver: wp.ref[SolverState], own: wp.
         own.mean[k] = guess
         own.steady[k] = guess
         own.origin[k] = -1
+    closest = real(0.3) * candidate.link_arc
     for e in range(solver.previous_contacts):
         held = problems.held[index, e]
-        if wp.abs(held.arc - candidate.arc) < real(0.3) * candidate.link_arc:
+        apart = wp.abs(held.arc - candidate.arc)
+        if apart < closest:
             guess = held.force
             if wp.static(smooth):
+                closest = apart
                 own.mean[k] = held.mean
                 own.steady[k] = held.steady
                 own.origin[k] = e
