@@ -79,7 +79,7 @@ class SweepLauncher:
         self._solver_of = partial(
             WhiskerSolver, device=self.device, needs=MESHES, block=BLOCK, sliced=sliced, bounds=bounds
         )
-        self.fidelity = fidelity = fidelity.touching(scenes.objects)
+        self.fidelity = fidelity
         self.solver = self._solver_of([fidelity.chain(whisker) for whisker in self.whiskers], fidelity)
         self._head = grid.head.matrix
         self._origin = np.asarray(grid.head.position)

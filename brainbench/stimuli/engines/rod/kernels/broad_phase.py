@@ -37,7 +37,7 @@ from brainbench.stimuli.motion.jobs import MILLI
 
 from .algebra import JointVector, Spatial, first_axis, rotate, vec3
 from .articulated_body import ChainState, ProximityState, hinge_direction
-from .centre_line import RodPlace, bent_link, enter_link, linearity, shortening
+from .centre_line import RodPlace, bent_link, enter_link, shortening
 from .distances import segments
 from .motion import BodyMotion, elapsed, instant, pose_at, pose_from
 from .narrow_phase import link_shape_distance
@@ -261,19 +261,16 @@ def query_distances(
 
 @wp.func(inline=True)
 def candidate_slot(
-    candidates: wp.ref[ContactCandidates], count: int, point: vec3, normal: vec3, ahead: real, near: real
+    candidates: wp.ref[ContactCandidates], count: int, point: vec3, normal: vec3, ahead: real, link: vec3
 ) -> int:
-    """Return where to keep a candidate (``count``: a further one; −1: nowhere).
-
-    The same contact may be seen from two links, or from both ends of a short gap: its places are no further apart than
-    the square root of ``near``.
-    """
+    """Return where to keep a candidate (``count``: a further one; −1: nowhere)."""
     slot = count
+    # The same contact seen from two links, or from both ends of a short gap.
     for j in range(count):
-        # Normals within 32°.
+        # Normals within 32° and places within a quarter of the link.
         apart = wp.length_sq(row(candidates.point, j) - point)
         same = wp.dot(row(candidates.normal, j), normal) > real(0.85)
-        if same and apart < near:
+        if same and apart < real(0.0625) * wp.length_sq(link):
             slot = j
     if wp.static(recorded):
         # By how much one of two links is nearer to what both touch.
@@ -449,12 +446,7 @@ def find_candidates(
                         if gap + real(1.5) * job.longest_step * wp.min(approach, zero) <= real(wp.static(CLOSED)):
                             state.closes = 1
                             state.closing_speed = wp.max(state.closing_speed, scene.shapes.speed[s])
-                        # Within a quarter of the link.
-                        near_here = real(0.0625) * wp.length_sq(link)
-                        if wp.static(smooth):
-                            # What touches beyond a joint that bends much holds the soft link behind it.
-                            near_here = near_here * linearity(rod.near_turn)
-                        slot = candidate_slot(candidates, count, point, normal, ahead, near_here)
+                        slot = candidate_slot(candidates, count, point, normal, ahead, link)
                         if slot == count:
                             count = count + 1
                         if slot >= 0:

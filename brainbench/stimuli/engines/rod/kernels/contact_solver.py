@@ -502,18 +502,6 @@ def store_forces(problems: ContactProblems, solver: wp.ref[SolverState], own: wp
     moment = vec3(zero, zero, zero)
     normal_sum = zero
     arc_sum = zero
-    if wp.static(smooth):
-        # Contacts that come of one share its means: otherwise it would bend the rod twice.
-        for e in range(warp_max(solver.previous_contacts)):
-            heirs = zero
-            for k in range(solver.own_count):
-                if solver.thread + k < solver.contacts and row(own.origin, k) == e:
-                    heirs = heirs + real(1.0)
-            heirs = group_sum(heirs)
-            for k in range(solver.own_count):
-                if solver.thread + k < solver.contacts and row(own.origin, k) == e:
-                    own.mean[k] = row(own.mean, k) / heirs
-                    own.steady[k] = row(own.steady, k) / heirs
     for k in range(solver.own_count):
         if solver.thread + k < solver.contacts and solver.live == 1:
             force_k = contact_force(own, k)
