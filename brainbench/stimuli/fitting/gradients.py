@@ -283,7 +283,7 @@ def contact_events(summary: Any, reason: str) -> ContactEvents:
     nearness: tuple[tuple[Nearness, bool], ...] = (
         ("ending", summary["least_force"] < SMALL_FORCE * summary["largest_force"]),
         ("beginning", summary["least_gap"] < SMALL_GAP),
-        ("passing", summary["least_lead"] < SMALL_LEAD),
+        ("passing", summary["least_lead"] < SMALL_LEAD or summary["jumped"] > 0),
         ("slipping", summary["fullest_cone"] > FULL_CONE),
         ("sticking", summary["slowest_slip"] < SMALL_SLIP * summary["fastest_slip"]),
     )
@@ -411,7 +411,6 @@ class GradientRun:
             task = make_task(job, self.fidelity, {}, silent=True)
             assert task is not None
             near = [jobs[index] for pair in self._changed for jobs in pair]
-            task = replace(task, fidelity=self.fidelity.touching(()) if _meets_mesh(task) else task.fidelity)
             # A parameter may take a whisker out of its plane, or move a base, where the run itself stays.
             if not task.twists and self.fidelity.twist is not False:
                 task = replace(task, twists=any(_leaves_plane(task, one) for one in near[1::2]))
@@ -536,12 +535,6 @@ def _at_once(function: Callable[[T], R], items: Sequence[T]) -> list[R]:
     """Return the function's results in order; launches on a processor leave the interpreter free."""
     with ThreadPoolExecutor(max_workers=min(len(items), usable_processors())) as pool:
         return list(pool.map(function, items))
-
-
-def _meets_mesh(task: JobTask) -> bool:
-    """Return True where a mesh is within reach: on the bent rod its derivatives are not sound, on links they are."""
-    parts = [part for body in task.bodies for part in (body.obstacle.surface, *body.obstacle.parts)]
-    return any(isinstance(part, Mesh | ConvexPart) for part in parts)
 
 
 def _leaves_plane(task: JobTask, job: Job) -> bool:

@@ -25,7 +25,7 @@ from brainbench.stimuli.fitting.gradients import (
 from brainbench.stimuli.fitting.recorded_run import RecordingSolver
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Cylinder, Obstacle, Sphere
-from tests.factories.contact_scenes import contact_jobs
+from tests.factories.contact_scenes import contact_jobs, meshed
 from tests.factories.gradients import COARSE, WHISKER, Swing, gradient_errors, touching_job, traces_at
 from tests.factories.pressed_whiskers import held_job, sliding_job
 
@@ -98,8 +98,9 @@ def test_what_cannot_be_differentiated_is_refused():
 
 
 SUMMARY = {
-    "first": 0, "begun": 1, "ended": 1, "slipped": 0, "degenerate": 0, "largest_force": 1.0, "least_force": 0.1,
-    "fastest_slip": 1.0, "slowest_slip": 0.1, "fullest_cone": 0.5, "least_gap": 0.01, "least_lead": 0.01,
+    "first": 0, "begun": 1, "ended": 1, "slipped": 0, "jumped": 0, "degenerate": 0, "largest_force": 1.0,
+    "least_force": 0.1, "fastest_slip": 1.0, "slowest_slip": 0.1, "fullest_cone": 0.5, "least_gap": 0.01,
+    "least_lead": 0.01,
 }  # fmt: skip
 
 
@@ -126,6 +127,7 @@ def test_beginning_end_and_slip_of_a_contact_are_counted():
         ({"least_force": 1e-7}, "ending"),
         ({"least_gap": 1e-9}, "beginning"),
         ({"least_lead": 1e-9}, "passing"),
+        ({"jumped": 1}, "passing"),
         ({"fullest_cone": 1 - 1e-7}, "slipping"),
         ({"slowest_slip": 1e-8}, "sticking"),
     ],
@@ -224,6 +226,52 @@ def test_contacts_on_the_bent_rod_have_the_gradients_of_central_differences(job,
     assert np.nanmax(np.fmin(errors, shorter)) < 1e-4
 
 
+def _meshed_jobs() -> dict[str, Job]:
+    """Return jobs of whiskers that touch triangles: posts of 32 sides, balls, boxes and the hollow of a trough."""
+    alone = contact_jobs(29, each=1)
+    around = contact_jobs(31, each=1, objects=("slot", "slip-off", "opposed", "face"))
+    jobs = {
+        "off a ball": touching_job(Sphere((11e-3, 2.2e-3, 0.6e-3), 1e-3), frames=42),
+        "past the end of a post": touching_job(
+            Capsule((11e-3, 2.2e-3, -1.2e-3), (11e-3, 2.7e-3, 8e-4), 5e-4), frames=42
+        ),
+        "between posts": held_job(frames=30),
+        "along a post": sliding_job(friction=0.3, frames=70),
+        **{f"post {k}": alone[k] for k in (8, 12, 21)},
+        **{f"edge {k}": alone[k] for k in (0, 23, 30)},
+        **{f"hollow {k}": alone[k] for k in (1, 3)},
+        **{f"slot {k}": around[k] for k in (8, 14)},
+        **{f"face {k}": around[k] for k in (15, 21)},
+        "opposed posts": around[12],
+    }
+    return dict(zip(jobs, meshed(list(jobs.values()), "triangles"), strict=True))
+
+
+MESHED = _meshed_jobs()
+
+
+@pytest.mark.parametrize(
+    "name", ["off a ball", "between posts", *(pytest.param(name, marks=pytest.mark.slow) for name in MESHED)]
+)
+def test_contacts_with_triangles_on_the_bent_rod_have_the_gradients_of_central_differences(name):
+    names = ("young_modulus", "base_radius", "tip_radius", "arc_length", "curvature", "damping_ratio", "base.theta")
+    # A long difference may meet another contact, a short one is rounding: one of the three is right. Sums over
+    # the joints may cancel to a ten-thousandth, and what is packed is differentiated less well than that.
+    parts = [
+        gradient_errors(MESHED[name], (*names, "object.x"), fidelity=Fidelity(links=12, time_step=1e-4), change=change)
+        for change in (1e-5, 1e-6, 1e-7)
+    ]
+    run = parts[0][1]
+    assert run._groups[0].solver.smooth
+    assert (run.traces[0].contact > 0).sum() > 5
+    assert np.nanmax(np.fmin.reduce([errors for errors, _ in parts])) < 1e-3
+
+
+def test_a_contact_that_jumps_between_edges_of_a_mesh_makes_the_gradient_one_sided():
+    run = GradientRun(lambda values: [MESHED["off a ball"]], [1.0], fidelity=Fidelity(links=12, time_step=1e-4))
+    assert run.gradient([np.ones((42, 6))]).events[0].close == ("passing",)
+
+
 def test_a_loaded_whisker_in_contact_has_the_gradients_of_central_differences():
     load = Load(0.0143, (0.0, 1e-6, 5e-7), stop=0.0153)
     job = replace(touching_job(SOLIDS["post"], friction=0.4), gravity=(0.0, 5.0, -5.0), loads=(load,))
@@ -282,10 +330,12 @@ def test_random_contact_scenes_have_the_gradients_of_central_differences(scene):
     except AssertionError as error:
         pytest.skip(f"not simulated: {error}")
     assert run.traces[0].contact.any()
-    if run.gradient([np.ones_like(run.traces[0].wrench)]).events[0].status == "degenerate":
+    events = run.gradient([np.ones_like(run.traces[0].wrench)]).events[0]
+    if events.status == "degenerate":
         pytest.skip("its contact forces have no unique solution, and the run says so")
-    # A change of contact between the two differences is no error of the gradient: at most one parameter has one.
-    assert np.sort(np.nan_to_num(errors).max(axis=0))[-2] < 1e-2
+    # A change of contact between the two differences is no error of the gradient: at most one parameter has one. Where
+    # a contact jumps to and fro between triangles of a hollow mesh, all do, and the run says so.
+    assert np.sort(np.nan_to_num(errors).max(axis=0))[-2] < 1e-2 or "passing" in events.close
 
 
 def test_whiskers_of_different_frames_and_lengths_share_parameters():

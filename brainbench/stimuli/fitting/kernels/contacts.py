@@ -20,7 +20,7 @@ from ..delassus import row as contact_row
 from ..parameters import real
 from ..state import WhiskerJob, row
 from .newton import DenseSystem, dense_entry, solve_dense, width
-from .records import ContactRecord, StepRecord
+from .records import ContactRecord, StepRecords
 
 SLIDING = 1 - 1e-6
 """Share of the friction cone from which a contact slides: forces of recorded steps are solved to rounding."""
@@ -71,6 +71,8 @@ class ContactSummary:
     """Steps with more contacts than the one before, with fewer, and with as many of which others slide."""
     ended: wp.int32
     slipped: wp.int32
+    jumped: wp.int32
+    """Steps in which a contact left one triangle for another that lies elsewhere along the link."""
     degenerate: wp.int32
     """Steps whose contacts had no unique derivative, or whose forces were not solved to rounding."""
     largest_force: real
@@ -89,8 +91,11 @@ class ContactSummary:
 
 
 @wp.func
-def summarize(summary: wp.ref[ContactSummary], contacts: wp.ref[StepContacts], step: StepRecord):
+def summarize(
+    summary: wp.ref[ContactSummary], contacts: wp.ref[StepContacts], records: StepRecords, place: int, index: int
+):
     """Add the next step."""
+    step = records.step[place, index]
     if summary.steps == 0:
         summary.first = contacts.count
         summary.least_force = real(1e30)
@@ -98,7 +103,15 @@ def summarize(summary: wp.ref[ContactSummary], contacts: wp.ref[StepContacts], s
         summary.least_gap = real(1e30)
         summary.least_lead = real(1e30)
     sliding = int(0)
+    jumped = int(0)
     for k in range(contacts.count):
+        now = records.contact[place, k, index]
+        if place > 0:
+            for e in range(records.step[place - 1, index].contacts):
+                last = records.contact[place - 1, e, index]
+                if last.link == now.link and last.shape == now.shape and last.triangle != now.triangle:
+                    if wp.max(last.share, now.share) < real(1.0) and wp.abs(last.share - now.share) > real(0.01):
+                        jumped = 1
         n = contact_row(contacts.normal, k)
         f = contact_row(contacts.force, k)
         v = contact_row(contacts.velocity, k)
@@ -116,6 +129,7 @@ def summarize(summary: wp.ref[ContactSummary], contacts: wp.ref[StepContacts], s
     summary.least_gap = wp.min(summary.least_gap, wp.abs(step.open_gap))
     summary.least_lead = wp.min(summary.least_lead, step.lead)
     summary.degenerate = summary.degenerate + step.inexact
+    summary.jumped = summary.jumped + jumped
     if summary.steps > 0:
         if contacts.count > summary.contacts:
             summary.begun = summary.begun + 1

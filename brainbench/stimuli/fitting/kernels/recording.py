@@ -7,12 +7,11 @@ the digit.
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import ANYWHERE, CAPSULE, CYLINDER, MESH, SPHERE
+from brainbench.stimuli.engines.rod.limits import CAPSULE, CYLINDER, MESH, SPHERE
 
 from ..algebra import rotate, unrotate, vec3, vec4, vec6
 from ..articulated_body import ChainState
-from ..distances import triangle_corners, triangle_feature
-from ..mesh_search import nearest_triangles
+from ..distances import triangle_corners, triangle_feature, triangle_place
 from ..motion import BodyMotion, pose_from
 from ..parameters import real, smooth
 from ..state import (
@@ -109,59 +108,33 @@ def primitive_curvature(kind: int, size: vec3, x: vec3, normal: vec3) -> Princip
 
 
 @wp.func
-def mesh_curvature(
-    shapes: ShapeArrays, s: int, a: vec3, b: vec3, share: real, x: vec3, normal: vec3, distance: real
-) -> PrincipalCurvature:
-    """Return the curvatures of the distance from a mesh at a point x beside the link a–b, by the feature found for it.
-
-    Between the ends of a straight link that is an edge or a corner, as ``narrow_phase`` looks for it; elsewhere, and
-    beside the bent rod, what is nearest.
-    """
+def triangle_curvature(shapes: ShapeArrays, face: int, x: vec3, normal: vec3, distance: real) -> PrincipalCurvature:
+    """Return the curvatures of the distance from a triangle at a point: from the corner, edge or face nearest to it."""
     found = PrincipalCurvature()
     found.direction = any_tangent(normal)
-    between = share < real(1.0)
-    start = a
-    stop = b
-    if wp.static(smooth):
-        between = False
-        stop = x
-    if not between:
-        start = stop
-    got = nearest_triangles(shapes, s, start, stop, real(wp.static(ANYWHERE)), real(1.01) * wp.abs(distance), -1, 0, 1)
-    which = got.end_face
-    v = got.end_v
-    w = got.end_w
-    if between:
-        which = got.face
-        v = got.v
-        w = got.w
-    if which >= 0:
-        face = shapes.face[s] + which
-        feature = triangle_feature(v, w)
-        # On an edge between coplanar faces the surface is flat.
-        flat = not between and wp.abs(wp.dot(normal, shapes.outward[face, 0])) > real(0.99999)
-        if feature > 0 and not flat:
-            rows = triangle_corners(shapes.corners, face)
-            found.second = real(1.0) / distance
-            if feature < 4:
-                found.first = found.second
-            elif feature == 4:
-                found.direction = wp.normalize(rows[2] - rows[1])
-            elif feature == 5:
-                found.direction = wp.normalize(rows[2] - rows[0])
-            else:
-                found.direction = wp.normalize(rows[1] - rows[0])
+    rows = triangle_corners(shapes.corners, face)
+    at = triangle_place(x, rows[0], rows[1], rows[2])
+    feature = triangle_feature(at[0], at[1], real(1e-12))
+    if feature > 0:
+        found.second = real(1.0) / distance
+    if feature == 4:
+        found.direction = wp.normalize(rows[2] - rows[1])
+    elif feature == 5:
+        found.direction = wp.normalize(rows[2] - rows[0])
+    elif feature == 6:
+        found.direction = wp.normalize(rows[1] - rows[0])
+    else:
+        found.first = found.second
     return found
 
 
 @wp.func
 def curvature_at(
-    shapes: ShapeArrays, s: int, body: BodyMotion, start: vec3, stop: vec3, share: real, x: vec3, normal: vec3,
-    distance: real,
-) -> vec6:  # fmt: skip
-    """Return the second derivatives of the distance from a shape at a place x beside a link, in world axes.
+    shapes: ShapeArrays, s: int, triangle: int, body: BodyMotion, x: vec3, normal: vec3, gap: real, radius: real
+) -> vec6:
+    """Return the second derivatives of the distance from a shape at a place x on the axis of a link, in world axes.
 
-    ``normal`` is its gradient there and ``distance`` its value; places count from the base.
+    ``normal`` is its gradient there; places count from the base. A surface is its ``triangle``.
     """
     local_quaternion = shapes.quaternion[s]
     scale = shapes.scale[s]
@@ -169,9 +142,9 @@ def curvature_at(
     local = unrotate(local_quaternion, unrotate(body.quaternion, x - body.place) - shapes.place[s]) / scale
     found = PrincipalCurvature()
     if shapes.kind[s] == wp.static(MESH):
-        a = unrotate(local_quaternion, unrotate(body.quaternion, start - body.place) - shapes.place[s]) / scale
-        b = unrotate(local_quaternion, unrotate(body.quaternion, stop - body.place) - shapes.place[s]) / scale
-        found = mesh_curvature(shapes, s, a, b, share, local, n, distance / scale)
+        # So near the surface the normal is fixed, see ``distances.way_out``.
+        if wp.abs(gap + radius) >= real(1e-3) * radius:
+            found = triangle_curvature(shapes, triangle, local, n, (gap + radius) / scale)
     else:
         found = primitive_curvature(shapes.kind[s], shapes.size[s] / scale, local, n)
     k1 = found.first / scale
@@ -204,16 +177,27 @@ def cubic_slopes(place: real) -> vec4:
 
 
 @wp.func
-def record_line(
-    candidates: wp.ref[ContactCandidates], slot: int, link: Cone, share: real, start_slide: real, end_slide: real
+def record_candidate(
+    candidates: wp.ref[ContactCandidates],
+    slot: int,
+    shape: int,
+    triangle: int,
+    link: Cone,
+    share: real,
+    start_slide: real,
+    end_slide: real,
 ):
-    """Note how the centre line runs at a candidate."""
-    slopes = cubic_slopes(share)
-    candidates.along[slot] = link.b - link.a + link.line.offset * slopes
-    candidates.bending[slot] = link.line.turn * slopes
-    candidates.tangent[slot] = line_tangent(link, share)
-    candidates.start_slide[slot] = start_slide
-    candidates.end_slide[slot] = end_slide
+    """Note what a candidate would touch and where, and how the centre line runs there."""
+    candidates.shape[slot] = shape
+    candidates.triangle[slot] = triangle
+    candidates.share[slot] = share
+    if wp.static(smooth):
+        slopes = cubic_slopes(share)
+        candidates.along[slot] = link.b - link.a + link.line.offset * slopes
+        candidates.bending[slot] = link.line.turn * slopes
+        candidates.tangent[slot] = line_tangent(link, share)
+        candidates.start_slide[slot] = start_slide
+        candidates.end_slide[slot] = end_slide
 
 
 @wp.func
@@ -252,7 +236,6 @@ def record_contacts(
     paused: PausedWhiskers,
     problems: ContactProblems,
     job: WhiskerJob,
-    chain: wp.ref[ChainState],
     candidates: wp.ref[ContactCandidates],
     step: Step,
     place: int,
@@ -279,6 +262,7 @@ def record_contacts(
             record = ContactRecord()
             record.link = i
             record.shape = shape
+            record.triangle = row(candidates.triangle, held.slot)
             record.share = share
             record.gap = given.gap
             record.friction = given.friction
@@ -287,10 +271,8 @@ def record_contacts(
             record.force = held.force
             body = pose_from(scene.motions, scene.shapes.track[shape], step.now, step.pose)
             x = given.point + given.normal * radius
-            start = row(chain.node, i)
-            stop = row(chain.node, i + 1)
             record.curvature = curvature_at(
-                scene.shapes, shape, body, start, stop, share, x, given.normal, given.gap + radius
+                scene.shapes, shape, record.triangle, body, x, given.normal, given.gap, radius
             )
             if wp.static(smooth):
                 record.rank = k

@@ -37,6 +37,8 @@ class ContactRecord:
 
     link: wp.int32
     shape: wp.int32
+    triangle: wp.int32
+    """Of a surface, that it touches."""
     share: real
     """Place along the link, 0 to 1; at 1 its end touches."""
     gap: real

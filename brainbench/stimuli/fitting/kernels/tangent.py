@@ -354,7 +354,7 @@ def tangent_step(
     if contacts.count > 0:
         build_system(job, chain, proximity, contacts, system, h, matrix)
     summary = outputs.contacts[index]
-    summarize(summary, contacts, records.step[place, index])
+    summarize(summary, contacts, records, place, index)
     lag = wp.max(h, job.beta)
     # Loads on each link and on all behind it.
     for back in range(1, job.links):

@@ -66,7 +66,7 @@ from .state import (
 )
 
 if recorded:
-    from .recorder.recording import record_line
+    from .recorder.recording import record_candidate
 
 
 @wp.struct
@@ -466,10 +466,10 @@ def find_candidates(
                             candidates.object_velocity[slot] = object_velocity
                             candidates.normal[slot] = normal
                             if wp.static(recorded):
-                                candidates.shape[slot] = s
-                                candidates.share[slot] = share
-                                if wp.static(smooth):
-                                    record_line(candidates, slot, link_here, share, start_slide, end_slide)
+                                triangle = wp.where(which == 1, found.end_triangle, found.triangle)
+                                record_candidate(
+                                    candidates, slot, s, triangle, link_here, share, start_slide, end_slide
+                                )
             proximity.clearance[i] = closest
     judge_overlap(state, deepest, crossing, base_gap, elapsed(now))
     return count

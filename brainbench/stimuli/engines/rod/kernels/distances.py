@@ -285,10 +285,12 @@ def triangle_corners(corners: wp.array(dtype=LeafCorners), face: int) -> mat33:
 
 
 @wp.func
-def triangle_feature(v: real, w: real) -> int:
-    """Return what holds a point of a triangle: 0 its face, 1 to 3 a corner, 4 to 6 the edge opposite to that corner."""
+def triangle_feature(v: real, w: real, low: real) -> int:
+    """Return what holds a point of a triangle: 0 its face, 1 to 3 a corner, 4 to 6 the edge opposite to that corner.
+
+    Coordinates up to ``low`` count as none.
+    """
     u = real(1.0) - v - w
-    low = real(1e-4)
     on_p = u > low
     on_q = v > low
     on_r = w > low
@@ -314,7 +316,7 @@ def pseudo_normal(shapes: ShapeArrays, face: int, v: real, w: real) -> vec3:
 
     The normal of one face tells the wrong side near a sharp edge or corner.
     """
-    return shapes.outward[face, triangle_feature(v, w)]
+    return shapes.outward[face, triangle_feature(v, w, real(1e-4))]
 
 
 @wp.func

@@ -21,10 +21,10 @@ from brainbench.stimuli.engines.rod.limits import (
 )
 
 from .algebra import unrotate, vec3, vec5
-from .distances import beside_triangle, line_triangle, primitive, pseudo_normal, segment_primitive, way_out
+from .distances import beside_triangle, halvings, line_triangle, primitive, pseudo_normal, segment_primitive, way_out
 from .mesh_search import NearestTriangles, beyond, nearest_triangles
 from .motion import BodyMotion, pose_from
-from .parameters import against, group_size, module_options, real, smooth
+from .parameters import against, group_size, module_options, real, recorded, smooth
 from .state import (
     ChainArrays,
     Cone,
@@ -46,8 +46,10 @@ CHORD, NEARER, DEPTHS, DEEPEST, DONE = range(5)
 
 
 @wp.func
-def touch_between(found: wp.ref[LinkDistance], nearest: vec5):
+def touch_between(found: wp.ref[LinkDistance], nearest: vec5, triangle: int):
     """Keep the place of a link that is nearest to a shape; places at its ends are handled apart."""
+    if wp.static(recorded):
+        found.triangle = triangle
     found.share = nearest[0]
     found.gap = nearest[1]
     found.normal = vec3(nearest[2], nearest[3], nearest[4])
@@ -98,10 +100,8 @@ def mesh_distance(shapes: ShapeArrays, s: int, link: Cone, within: real, got: Ne
         if found.clearance > within:
             # No contact within reach, but the axis lies inside: without this a deep overlap would count as free.
             if out[3] < real(0.0):
+                touch_between(found, vec5(share, out[3] - radius, out[0], out[1], out[2]), first + face)
                 found.between = 1
-                found.share = share
-                found.gap = out[3] - radius
-                found.normal = vec3(out[0], out[1], out[2])
                 found.clearance = real(0.0)
             return found
     # Further away a search need not have found the nearest.
@@ -113,10 +113,12 @@ def mesh_distance(shapes: ShapeArrays, s: int, link: Cone, within: real, got: Ne
         if got.share > real(1e-3) and got.share < real(1.0 - 1e-3) and not (flat and got.side > real(0.0)):
             radius = ra + (rb - ra) * got.share
             out = way_out(shapes, face, got.v, got.w, a + (b - a) * got.share, wp.sqrt(got.side), radius)
-            touch_between(found, vec5(got.share, out[3] - radius, out[0], out[1], out[2]))
+            touch_between(found, vec5(got.share, out[3] - radius, out[0], out[1], out[2]), face)
     if got.end_face >= 0 and got.end <= within * within:
         face = first + got.end_face
         out = way_out(shapes, face, got.end_v, got.end_w, b, wp.sqrt(got.end), rb)
+        if wp.static(recorded):
+            found.end_triangle = face
         found.end = 1
         found.end_gap = out[3] - rb
         found.end_normal = vec3(out[0], out[1], out[2])
@@ -250,12 +252,13 @@ def link_shape_distance(
                         high = share
                     else:
                         low = share
-                    if measured == wp.static(DEPTH_HALVINGS):
+                    # Differences of simulations see the last of few halvings.
+                    if measured == wp.static(halvings if recorded else DEPTH_HALVINGS):
                         if low == real(0.0):
                             share = real(0.0)
                         if high == real(1.0):
                             share = real(1.0)
-                        touch_between(found, vec5(share, -depth, out[0], out[1], out[2]))
+                        touch_between(found, vec5(share, -depth, out[0], out[1], out[2]), triangle)
                         phase = int(DONE)
             if wp.static(smooth):
                 if phase == NEARER:
@@ -281,7 +284,7 @@ def link_shape_distance(
                             measured = int(0)
                             phase = int(DEPTHS)
                         else:
-                            touch_between(found, nearest)
+                            touch_between(found, nearest, face)
                     aside = real(wp.static(ASIDE)) * real((looked + 1) % 3 - 1)
                     share = wp.clamp(nearest[0] + aside, real(0.0), real(1.0))
                     farthest = real(1.0 - 3e-6) * far
@@ -304,7 +307,7 @@ def link_shape_distance(
         beside = segment_primitive(shapes.kind[s], shapes.size[s] / scale, link, near, tip)
         # The gap counts from the skin, the bound from the axis; the thinner end keeps it a lower bound.
         found.clearance = beside[1] + wp.min(ra, rb)
-        touch_between(found, beside)
+        touch_between(found, beside, -1)
         found.end = 1
         found.end_gap = tip[3] - rb
         found.end_normal = vec3(tip[0], tip[1], tip[2])

@@ -376,6 +376,7 @@ class ContactCandidates:
         count: wp.int32
         shape: PerCandidateInt
         share: PerCandidate1  # place along the link, 0 to 1
+        triangle: PerCandidateInt  # of a surface, that it touches
         lead: PerCandidate1  # how much nearer (mm) than the neighbouring link it is, if that touches the same
     if recorded and smooth:
         along: PerCandidate3  # rate of the centre line's place along the link, that of its tangent, and its tangent
@@ -413,6 +414,9 @@ class LinkDistance:
     """Leaf of the search tree (+ 1) where the nearest triangle is; 0 without."""
     if smooth:
         face: wp.int32
+    if recorded:
+        triangle: wp.int32  # of a surface, that it touches between its ends, and at its far end
+        end_triangle: wp.int32
 
 
 @wp.struct

@@ -350,7 +350,7 @@ def run(
                     if paused.keep == 1:
                         candidates.count = count
                         place = state.steps - first_step
-                        record_contacts(scene, paused, problems, job, chain, candidates, step, place, solved)
+                        record_contacts(scene, paused, problems, job, candidates, step, place, solved)
             state.contacts = int(0)
             touched = int(0)
             if wp.static(against > NOTHING and stage != 2) and solved == 1:
