@@ -1,4 +1,4 @@
-"""Adjoint of the contacts of a step: the solved conditions, and the system of their multipliers.
+"""Change of the contacts of a step: the solved conditions, and the system of the change of their forces.
 
 With the velocity v at the end of the step, the closing rate κ = min(−g, crevice)/h, the force f, the normal n and the
 direction of slip u, a pressing contact obeys c = 0 with
@@ -6,9 +6,9 @@ direction of slip u, a pressing contact obeys c = 0 with
     sticking   c = v − κ n,
     sliding    c = n (n·v − κ) + σ (f − n (n·f) + μ (n·f) u),
 
-three equations for the three components of f in world axes (σ only makes the units alike; frictionless: μ = 0). Their
-multipliers ν solve (G A + Bᵀ) ν = w − f̄ with A = ∂c/∂v (symmetric), B = ∂c/∂f, the Delassus matrix G, the velocity w
-that the virtual motion without contacts has there, and the derivative f̄ of the outputs by the force.
+three equations for the three components of f in world axes (σ only makes the units alike; frictionless: μ = 0). The
+change of the forces solves (A G + B) δf = −δc − A w with A = ∂c/∂v (symmetric), B = ∂c/∂f, the Delassus matrix G, the
+change δc at fixed accelerations and forces, and the change w of the velocities without a change of the forces.
 """
 
 import warp as wp
@@ -143,14 +143,6 @@ def summarize(
 
 
 @wp.func
-def unit(d: int) -> vec3:
-    """Return a unit vector of the world axes."""
-    axis = vec3(real(0.0), real(0.0), real(0.0))
-    axis[d] = real(1.0)
-    return axis
-
-
-@wp.func
 def set_state(contacts: wp.ref[StepContacts], k: int, contact: ContactRecord, velocity: vec3):
     """Find whether a contact sticks or slides, and where to."""
     n = contact.normal
@@ -164,7 +156,7 @@ def set_state(contacts: wp.ref[StepContacts], k: int, contact: ContactRecord, ve
     contacts.slides[k] = 1
     contacts.coefficient[k] = contact.friction
     contacts.friction[k] = real(0.0)
-    contacts.slip[k] = vec3(real(0.0), real(0.0), real(0.0))
+    contacts.slip[k] = vec3()
     if contact.friction > real(0.0):
         if wp.length(ft) < real(wp.static(SLIDING)) * contact.friction * fn:
             contacts.slides[k] = 0
@@ -177,30 +169,23 @@ def set_state(contacts: wp.ref[StepContacts], k: int, contact: ContactRecord, ve
 @wp.func
 def velocity_block(contacts: wp.ref[StepContacts], k: int) -> mat33:
     """Return A = ∂c/∂v of a contact."""
-    zero = real(0.0)
-    one = real(1.0)
-    whole = mat33(one, zero, zero, zero, one, zero, zero, zero, one)
+    whole = wp.identity(n=3, dtype=real)
     if contact_row(contacts.slides, k) == 0:
         return whole
     n = contact_row(contacts.normal, k)
     u = contact_row(contacts.slip, k)
     turning = contact_row(contacts.scale, k) * contact_row(contacts.friction, k)
-    across = whole - wp.outer(n, n) - wp.outer(u, u)
-    return wp.outer(n, n) + across * turning
+    return wp.outer(n, n) + (whole - wp.outer(n, n) - wp.outer(u, u)) * turning
 
 
 @wp.func
 def force_block(contacts: wp.ref[StepContacts], k: int) -> mat33:
     """Return B = ∂c/∂f of a contact."""
-    zero = real(0.0)
-    one = real(1.0)
     if contact_row(contacts.slides, k) == 0:
-        return mat33(zero, zero, zero, zero, zero, zero, zero, zero, zero)
+        return mat33()
     n = contact_row(contacts.normal, k)
-    whole = mat33(one, zero, zero, zero, one, zero, zero, zero, one)
-    coefficient = contact_row(contacts.coefficient, k)
-    sliding = whole - wp.outer(n, n) + wp.outer(contact_row(contacts.slip, k), n) * coefficient
-    return sliding * contact_row(contacts.scale, k)
+    away = contact_row(contacts.slip, k) * contact_row(contacts.coefficient, k) - n
+    return (wp.identity(n=3, dtype=real) + wp.outer(away, n)) * contact_row(contacts.scale, k)
 
 
 @wp.func
@@ -214,7 +199,9 @@ def carry_units(
     """Carry unit forces at the contacts up the factorised chain, as ``delassus.build_delassus`` does."""
     for k in range(contacts.count):
         for d in range(3):
-            force = spatial(wp.cross(contact_row(contacts.point, k), unit(d)), unit(d))
+            unit = vec3()
+            unit[d] = real(1.0)
+            force = spatial(wp.cross(contact_row(contacts.point, k), unit), unit)
             for back in range(contact_row(contacts.link, k) + 1):
                 i = contact_row(contacts.link, k) - back
                 felt = force_over_joint(joint_record(chain, proximity, i), i, force)

@@ -9,7 +9,7 @@ import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import CAPSULE, CYLINDER, MESH, SPHERE
 
-from ..algebra import rotate, unrotate, vec3, vec4, vec6
+from ..algebra import rotate, symmetric_outer, unrotate, vec3, vec4, vec6
 from ..articulated_body import ChainState
 from ..distances import triangle_corners, triangle_feature, triangle_place
 from ..motion import BodyMotion, pose_from
@@ -36,42 +36,28 @@ from .records import ContactRecord, StepRecord
 class PrincipalCurvature:
     """Principal curvatures of the surface that lies at the distance of a point, in the frame of the shape."""
 
-    first: real
+    along: real
     """Along ``direction``."""
-    second: real
-    """Across it."""
+    across: real
+    """Across it; in all directions where there is none."""
     direction: vec3
 
 
 @wp.func
-def any_tangent(normal: vec3) -> vec3:
-    """Return some unit vector normal to a unit vector."""
-    other = vec3(real(1.0), real(0.0), real(0.0))
-    if wp.abs(normal[0]) > real(0.7):
-        other = vec3(real(0.0), real(1.0), real(0.0))
-    return wp.normalize(wp.cross(normal, other))
-
-
-@wp.func
-def primitive_curvature(kind: int, size: vec3, x: vec3, normal: vec3) -> PrincipalCurvature:
+def primitive_curvature(kind: int, size: vec3, x: vec3) -> PrincipalCurvature:
     """Return the curvatures of the distance from a primitive at a point; the cases of ``distances.primitive``."""
     zero = real(0.0)
     one = real(1.0)
     found = PrincipalCurvature()
-    found.direction = any_tangent(normal)
     axis = vec3(zero, zero, one)
     radial = wp.sqrt(x[0] * x[0] + x[1] * x[1])
     if kind == wp.static(SPHERE):
-        found.first = one / wp.length(x)
-        found.second = found.first
+        found.across = one / wp.length(x)
     elif kind == wp.static(CAPSULE):
         z = x[2] - wp.clamp(x[2], -size[1], size[1])
+        found.across = one / wp.sqrt(radial * radial + z * z)
         if z == zero:
             found.direction = axis
-            found.second = one / radial
-        else:
-            found.first = one / wp.sqrt(radial * radial + z * z)
-            found.second = found.first
     elif kind == wp.static(CYLINDER):
         side = radial - size[0]
         end = wp.abs(x[2]) - size[1]
@@ -79,52 +65,41 @@ def primitive_curvature(kind: int, size: vec3, x: vec3, normal: vec3) -> Princip
             # The rim: a circle, so that the surface around it is a torus.
             far = wp.sqrt(side * side + end * end)
             found.direction = vec3(-x[1] / radial, x[0] / radial, zero)
-            found.first = side / (far * radial)
-            found.second = one / far
+            found.along = side / (far * radial)
+            found.across = one / far
         elif side > end:
             found.direction = axis
-            found.second = one / radial
+            found.across = one / radial
     else:
-        beyond = vec3(
-            wp.max(wp.abs(x[0]) - size[0], zero),
-            wp.max(wp.abs(x[1]) - size[1], zero),
-            wp.max(wp.abs(x[2]) - size[2], zero),
-        )
+        beyond = vec3()
         count = int(0)
         for d in range(3):
-            if beyond[d] > zero:
-                count = count + 1
+            beyond[d] = wp.max(wp.abs(x[d]) - size[d], zero)
+            count = count + int(beyond[d] > zero)
         if count >= 2:
-            found.second = one / wp.length(beyond)
-            found.first = found.second
+            found.across = one / wp.length(beyond)
         if count == 2:
-            found.first = zero
-            edge = vec3(zero, zero, zero)
             for d in range(3):
                 if beyond[d] == zero:
-                    edge[d] = one
-            found.direction = edge
+                    found.direction[d] = one
     return found
 
 
 @wp.func
-def triangle_curvature(shapes: ShapeArrays, face: int, x: vec3, normal: vec3, distance: real) -> PrincipalCurvature:
+def triangle_curvature(shapes: ShapeArrays, face: int, x: vec3, distance: real) -> PrincipalCurvature:
     """Return the curvatures of the distance from a triangle at a point: from the corner, edge or face nearest to it."""
     found = PrincipalCurvature()
-    found.direction = any_tangent(normal)
     rows = triangle_corners(shapes.corners, face)
     at = triangle_place(x, rows[0], rows[1], rows[2])
     feature = triangle_feature(at[0], at[1], real(1e-12))
     if feature > 0:
-        found.second = real(1.0) / distance
+        found.across = real(1.0) / distance
     if feature == 4:
         found.direction = wp.normalize(rows[2] - rows[1])
     elif feature == 5:
         found.direction = wp.normalize(rows[2] - rows[0])
     elif feature == 6:
         found.direction = wp.normalize(rows[1] - rows[0])
-    else:
-        found.first = found.second
     return found
 
 
@@ -138,27 +113,18 @@ def curvature_at(
     """
     local_quaternion = shapes.quaternion[s]
     scale = shapes.scale[s]
-    n = unrotate(local_quaternion, unrotate(body.quaternion, normal))
     local = unrotate(local_quaternion, unrotate(body.quaternion, x - body.place) - shapes.place[s]) / scale
     found = PrincipalCurvature()
-    if shapes.kind[s] == wp.static(MESH):
-        # So near the surface the normal is fixed, see ``distances.way_out``.
-        if wp.abs(gap + radius) >= real(1e-3) * radius:
-            found = triangle_curvature(shapes, triangle, local, n, (gap + radius) / scale)
-    else:
-        found = primitive_curvature(shapes.kind[s], shapes.size[s] / scale, local, n)
-    k1 = found.first / scale
-    k2 = found.second / scale
-    t = rotate(body.quaternion, rotate(local_quaternion, found.direction))
-    u = wp.cross(normal, t)
-    return vec6(
-        k1 * t[0] * t[0] + k2 * u[0] * u[0],
-        k1 * t[1] * t[1] + k2 * u[1] * u[1],
-        k1 * t[2] * t[2] + k2 * u[2] * u[2],
-        k1 * t[0] * t[1] + k2 * u[0] * u[1],
-        k1 * t[0] * t[2] + k2 * u[0] * u[2],
-        k1 * t[1] * t[2] + k2 * u[1] * u[2],
-    )
+    if shapes.kind[s] != wp.static(MESH):
+        found = primitive_curvature(shapes.kind[s], shapes.size[s] / scale, local)
+    # So near a surface the normal is fixed, see ``distances.way_out``.
+    elif wp.abs(gap + radius) >= real(1e-3) * radius:
+        found = triangle_curvature(shapes, triangle, local, (gap + radius) / scale)
+    direction = rotate(body.quaternion, rotate(local_quaternion, found.direction))
+    across = found.across / scale
+    more = found.along / scale - across
+    whole = vec6(across, across, across, real(0.0), real(0.0), real(0.0))
+    return whole + symmetric_outer(normal * -across, normal, direction * more, direction)
 
 
 @wp.func
