@@ -6,24 +6,56 @@ Letters: B environment, N probe, C channel; readings are stored planar [C, B, N]
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from inspect import get_annotations
+from typing import Annotated, Any, get_args, get_origin
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.devices import warp
+from brainbench.core.limits import annotation_of
 from robotics_bridge.sensors.noise.model import Noise
 
 _MOST = 512  # packed launches that are kept
 
 
-def fill(kind: Any, source: Any, **fields: Any) -> Any:
-    """Return a Warp structure: its fields as given, or as the attributes of a configuration that bear their names."""
+def numbers_of(*configs: type) -> Callable[[type], type]:
+    """Give a Warp structure a field for every number, pair or triple that configurations themselves state.
+
+    Numbers that may be None are left to the structure. Stands below ``@wp.struct``.
+    """
+
+    def decorate(cls: type) -> type:
+        numbers = {}
+        for config in configs:
+            stated = [field.name for field in fields(config) if field.name in get_annotations(config)]
+            numbers |= {name: _dtype(annotation_of(config, name)) for name in stated}
+        numbers = {name: dtype for name, dtype in numbers.items() if dtype}
+        cls.__annotations__ = {**numbers, **get_annotations(cls)}
+        return cls
+
+    return decorate
+
+
+def _dtype(annotation: Any) -> Any:
+    """Return the Warp type of a number or of several, None for anything else."""
+    wp = warp()
+    if get_origin(annotation) is Annotated:
+        return _dtype(annotation.__origin__)
+    if get_origin(annotation) is tuple:
+        kinds = tuple(map(_dtype, get_args(annotation)))
+        return {(wp.float32,) * 2: wp.vec2f, (wp.float32,) * 3: wp.vec3f, (wp.int32,) * 3: wp.vec3i}.get(kinds)
+    return {float: wp.float32, int: wp.int32, bool: wp.int32}.get(annotation)
+
+
+def fill(kind: Any, *sources: Any, **values: Any) -> Any:
+    """Return a Warp structure: its fields as given, or as the attributes of configurations that bear their names."""
     struct = kind()
     for name in kind.vars:
-        setattr(struct, name, fields[name] if name in fields else getattr(source, name))
+        given = values[name] if name in values else next(getattr(s, name) for s in sources if hasattr(s, name))
+        setattr(struct, name, given)
     return struct
 
 

@@ -17,7 +17,7 @@ from brainbench.core.devices import warp
 from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice
-from robotics_bridge.sensors.kernels.readout import CLEAN, FUSED, STAGED, ProbeArrays, ReadoutArrays, append_history
+from robotics_bridge.sensors.kernels.readout import CLEAN, FUSED, STAGED, ProbeArrays, append_history
 from robotics_bridge.sensors.noise.stages import ReadingNoise
 from robotics_bridge.sensors.probes.placement import enclosing_sphere
 from robotics_bridge.sensors.queries.pairs import PairTable
@@ -75,46 +75,17 @@ class Runtime(abc.ABC):
                 name, sensor.noise, self.count, sensor.layout(), sensor.channels == 0, mask
             )
             self.count += count
-        noises = [sensor.noise for sensor in sensors.values()]
-        self.noisy = any(noise.active for noise in noises)
-        staged = self.noisy and (not fusable or any(noise.crosstalk for noise in noises))
-        # Crosstalk needs the values of neighbours, which threads of one kernel cannot have; all other noise is fused.
-        self.mode = STAGED if staged else FUSED if self.noisy else CLEAN
-        fused = self.mode == FUSED
-        self.stores = (
-            fused and any(noise.hysteresis for noise in noises),
-            fused and any(noise.walk for noise in noises),
-        )
-        """True for hysteresis, and for drift, that the sensor's kernel keeps."""
-        shape = (channels, context.num_envs, self.count)
-
-        def planes(wanted: bool) -> Any:
-            return context.zeros(shape if wanted else (1, 1, 1))
-
-        self._noise = ReadingNoise(list(self.slices.values()), channels, context, staged=staged)
-        self.part, self.probe, self.make_room = self._noise.part, self._noise.probe, self._noise.make_room
-        io = ReadoutArrays()
-        io.truth = planes(True)
-        io.measured = planes(True) if self.noisy else io.truth
-        io.hysteresis, io.walk = (planes(wanted) for wanted in self.stores)
-        io.age, io.episode, io.status = context.age, context.episode, context.pairs.status
-        io.knobs, io.env_offset = self._noise.params, context.env_offset
-        self.io = io
+        self._noise = noise = ReadingNoise(list(self.slices.values()), channels, context, fusable=fusable)
+        self.io = noise.io
         """Warp structure of the readings: ``truth`` and ``measured``, planar."""
-        self.rings = self._noise.rings
-        """Those of delays that the user asked for."""
-        arrays = [io.truth, io.measured, io.hysteresis, io.walk]
-        wanted = (True, self.noisy, *self.stores)
-        self.readings = [array for array, stored in zip(arrays, wanted, strict=True) if stored] + self._noise.lasting
-        """Those of readings and their noise."""
-        self.readable: list[Any] = [io.truth, *([io.measured] if self.noisy else []), self._noise.late]
-        """Those that can be read, planar, which a reset clears."""
+        self.io.status = context.pairs.status
+        self.mode, self.stores, self.make_room = noise.mode, noise.stores, noise.make_room
 
     def update(self, state: HandState, dt: float) -> None:
         """Read the state; ``dt`` seconds have passed since the last update."""
         self.io.dt = dt
         self.run_kernels(state, dt)
-        self._noise.launch(self.io.measured, self.io.measured, dt)
+        self._noise.launch(dt)
 
     def seed(self) -> None:
         """Draw from the context's present seed from now on."""
@@ -122,7 +93,12 @@ class Runtime(abc.ABC):
 
     def memory(self) -> list[Any]:
         """Return the Warp arrays of environments that later updates depend on."""
-        return [array for array in (*self.readings, *self.lasting, *self.rings) if array.size]
+        return [array for array in (*self._noise.memory, *self.lasting, *self._noise.rings) if array.size]
+
+    @property
+    def readable(self) -> list[Any]:
+        """Warp arrays [C, B, N] that can be read, which a reset clears."""
+        return self._noise.readable
 
     @abc.abstractmethod
     def run_kernels(self, state: HandState, dt: float) -> None:
@@ -130,7 +106,7 @@ class Runtime(abc.ABC):
 
     def measured(self) -> Any:
         """Return the planar Warp array of measured readings."""
-        return self._noise.read(self.io.measured)
+        return self._noise.read()
 
 
 class ProbeRuntime(Runtime):
@@ -170,7 +146,7 @@ class ProbeRuntime(Runtime):
         packed = [np.column_stack([s.probes.position, s.probes.radius]) for s in sensors.values()]
         p.packed = context.array(np.concatenate(packed), wp.vec4f)
         counts = [part.count for part in self.slices.values()]
-        p.slot, p.part, p.probe = context.array(np.repeat(self.slots, counts), int), self.part, self.probe
+        p.slot = context.array(np.repeat(self.slots, counts), int)
         self.probes = p
 
     def launch(self, kernel: Any, *inputs: Any) -> None:
@@ -216,7 +192,6 @@ class History:
         self.part, self.length, self._context = part, length, context
         self.ring: Any = context.zeros((2 * length, channels, context.num_envs, part.count))
         """Warp array [2 T, C, B, N]: every reading is written twice."""
-        self.rings = [self.ring]
 
     def launch(self, value: Any, counter: Any) -> None:
         """Append the reading of this update; ``counter`` [1] counts updates on the device."""

@@ -138,7 +138,7 @@ class DriveAudioRuntime(Runtime):
         super().__init__(sensors, self.samples, context, fusable=False)
         self._drives = dict(sensors)
         arrays, shape = DriveSoundArrays(), (context.num_envs, self.count)
-        arrays.settings, arrays.part, arrays.number = self._settings(), self.part, self.probe
+        arrays.settings = self._settings()
         for name in ("effort", "speed", "last_loud", "last_speed", "phase", "hum_phase"):
             setattr(arrays, name, context.zeros(shape))
             self.lasting.append(getattr(arrays, name))

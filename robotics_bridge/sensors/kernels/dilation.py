@@ -10,12 +10,14 @@ from functools import cache
 from typing import Any
 
 from brainbench.core.devices import warp
+from robotics_bridge.sensors.context import numbers_of
 from robotics_bridge.sensors.kernels.distance import FAR, SolidArrays, SolidShape, shape_functions
 from robotics_bridge.sensors.kernels.noise import episode_draw, radius_noise
 from robotics_bridge.sensors.kernels.pairs import PairArrays
 from robotics_bridge.sensors.kernels.probe import deepest_function
 from robotics_bridge.sensors.kernels.proximity import BLOCK, CloudArrays
 from robotics_bridge.sensors.kernels.readout import ProbeArrays, ReadoutArrays, readout_functions, silenced
+from robotics_bridge.sensors.taxels.sensors import ElastomerTaxel, Layer
 
 wp = warp()
 
@@ -23,27 +25,13 @@ NEGLIGIBLE = 17.0  # exponent of a Gaussian from which it is left out: 4e-8 of i
 
 
 @wp.struct
+@numbers_of(ElastomerTaxel, Layer)
 class GelParams:
-    """Material and grid of one sensor; material as in ``ElastomerTaxel`` and ``Layer``."""
+    """One sensor: its material, with the names and units of ``ElastomerTaxel`` and ``Layer``, and its grid."""
 
-    dilate: wp.float32
-    shear: wp.float32
-    spread: wp.float32
-    """λ_d of 4.19 [1/m²]."""
-    smear: wp.float32
-    """λ_s of 4.20 [1/m²]."""
-    exponent: wp.float32
-    enter: wp.float32
-    leave: wp.float32
     layered: wp.int32
-    poisson: wp.float32
-    softening: wp.float32
-    thickness: wp.float32
-    recoil: wp.float32
-    expansion_x: wp.float32
-    expansion_y: wp.float32
-    frame_x: wp.float32
-    frame_y: wp.float32
+    expansion: wp.vec2f
+    frame: wp.vec2f
     center: wp.vec3f
     along: wp.vec3f
     across: wp.vec3f
@@ -53,7 +41,6 @@ class GelParams:
     columns: wp.int32
     step_x: wp.float32
     step_y: wp.float32
-    link: wp.int32
     slot: wp.int32
     own_first: wp.int32
     own_last: wp.int32
@@ -137,7 +124,7 @@ def indent_kernel(kinds: frozenset[int], raycast: bool, planes: int, in_turn: bo
         if wp.static(in_turn):
             end = probes.radius.shape[0]
         for n in range(first, end):
-            part = probes.part[n]
+            part = io.part[n]
             h = float(0.0)
             noisy = float(0.0)
             if probes.radius[n] > 0.0 and pairs.count[env, probes.slot[n]] > 0:
@@ -145,7 +132,7 @@ def indent_kernel(kinds: frozenset[int], raycast: bool, planes: int, in_turn: bo
                 h = wp.max(-best, 0.0)
                 if wp.static(planes == 2):
                     number = env + io.env_offset
-                    error = radius_noise(io.knobs[part], number, probes.probe[n], io.age[env], io.episode[env])
+                    error = radius_noise(io.knobs[part], number, io.probe[n], io.age[env], io.episode[env])
                     noisy = wp.max(error - best, 0.0)
                 # A stamp in place of a flag needs no clearing: pads that nothing touches skip all later sums.
                 if h > 0.0 or noisy > 0.0:
@@ -186,11 +173,11 @@ def spread_kernel(planes: int, in_turn: bool = False) -> Any:
         if wp.static(in_turn):
             end = probes.radius.shape[0]
         for n in range(first, end):
-            part = probes.part[n]
+            part = io.part[n]
             if pads.stamp[env, part] != mark_of(io, env):
                 continue
             gel = pads.gels[part]
-            place = probes.probe[n] % gel.columns
+            place = io.probe[n] % gel.columns
             row = n - place
             for plane in range(wp.static(planes)):
                 plain = float(0.0)
@@ -288,8 +275,8 @@ def marker_kernel(
         for n in range(first, end):
             if silenced(io, 3, env, n, probes.radius[n]):
                 continue
-            part = probes.part[n]
-            probe = probes.probe[n]
+            part = io.part[n]
+            probe = io.probe[n]
             gel = pads.gels[part]
             x = probes.position[n]
             normal = probes.normal[n]
@@ -301,7 +288,7 @@ def marker_kernel(
                     total = float(0.0)
                     if wp.static(way == 2):
                         # The three convolutions of 4.19 are done; only s_d and the directions of the pad remain.
-                        u = gel.dilate * (
+                        u = gel.dilate_scale * (
                             pads.spread[3 * plane, env, n] * gel.along
                             + pads.spread[3 * plane + 1, env, n] * gel.across
                             + pads.spread[3 * plane + 2, env, n] * normal
@@ -320,25 +307,25 @@ def marker_kernel(
                             along += w * pads.spread[3 * plane + 1, env, at]
                             across += w * float(place - source) * gel.step_y * pads.spread[3 * plane, env, at]
                             raised += w * pads.spread[3 * plane + 2, env, at]
-                        u = gel.dilate * (along * gel.along + across * gel.across + raised * normal)
+                        u = gel.dilate_scale * (along * gel.along + across * gel.across + raised * normal)
                     else:
                         for source in range(gel.rows * gel.columns):
                             h = pads.indentation[plane, env, gel.start + source]
                             if h > 0.0:
                                 # 4.19 as written, source by source: for pads whose markers form no planar grid.
                                 away = across_plane(x - probes.position[gel.start + source], normal)
-                                square = gel.spread * wp.dot(away, away)
+                                square = gel.dilate_spread * wp.dot(away, away)
                                 w = wp.exp(-square)
                                 if wp.static(layered):
                                     # Layer term 1 − κ λ_d r² (recoil κ): what is pushed outwards near an indenter is
                                     # drawn in farther off.
                                     away = (1.0 - gel.recoil * square) * away
                                 bulge = pads.indentation[wp.static(planes) + plane, env, gel.start + source]
-                                u += gel.dilate * w * (h * away + bulge * normal)
+                                u += gel.dilate_scale * w * (h * away + bulge * normal)
                     if wp.static(layered):
                         # Layer term: a layer that can hardly be compressed spreads in proportion to the mean
                         # indentation.
-                        if gel.expansion_x != 0.0 or gel.expansion_y != 0.0:
+                        if gel.expansion[0] != 0.0 or gel.expansion[1] != 0.0:
                             for source in range(gel.rows * gel.columns):
                                 total += pads.indentation[plane, env, gel.start + source]
                             local = x - gel.center
@@ -347,11 +334,11 @@ def marker_kernel(
                             scale = total / float(gel.rows * gel.columns)
                             ux = bx
                             uy = by
-                            if gel.frame_x > 0.0:
+                            if gel.frame[0] > 0.0:
                                 # Displacement of a layer whose edges are clamped: the first mode that vanishes there.
-                                ux = gel.frame_x / wp.pi * wp.sin(wp.pi * wp.clamp(bx / gel.frame_x, -1.0, 1.0))
-                                uy = gel.frame_y / wp.pi * wp.sin(wp.pi * wp.clamp(by / gel.frame_y, -1.0, 1.0))
-                            u += scale * (gel.expansion_x * ux * gel.along + gel.expansion_y * uy * gel.across)
+                                ux = gel.frame[0] / wp.pi * wp.sin(wp.pi * wp.clamp(bx / gel.frame[0], -1.0, 1.0))
+                                uy = gel.frame[1] / wp.pi * wp.sin(wp.pi * wp.clamp(by / gel.frame[1], -1.0, 1.0))
+                            u += scale * (gel.expansion[0] * ux * gel.along + gel.expansion[1] * uy * gel.across)
                     if plane == 0:
                         truth = u
                     else:
@@ -393,7 +380,7 @@ def marker_kernel(
                                     strength = 0.0
                             away = p - here
                             rise = wp.dot(away, up)
-                            far = gel.smear * (wp.dot(away, away) - rise * rise)
+                            far = gel.shear_spread * (wp.dot(away, away) - rise * rise)
                             if far < wp.static(NEGLIGIBLE):
                                 w = strength * wp.exp(-far)
                                 mass += w
@@ -548,7 +535,7 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool) -> A
                     way = z - wp.vec3f(kept, pads.anchor[index, 1, env], pads.anchor[index, 2, env])
                     if wp.length_sq(way) > 0.0:
                         # s_s h_p of 4.20; the Gaussian and the slip z − e follow for each marker.
-                        strength = gel.shear * wp.max(-phi, 0.0)
+                        strength = gel.shear_scale * wp.max(-phi, 0.0)
                     holds += 1
             if strength > 0.0:
                 # Points that moved are listed without gaps: markers loop over these alone, without asking each point.
@@ -646,7 +633,7 @@ def sum_shear(
                         for row in range(gel.rows):
                             # exp(−λ_s r²) = exp(−λ_s y²) exp(−λ_s x²): rows + columns exponentials a point. Rows and
                             # columns with no weight bound the span that is added to.
-                            w = weight(gel.smear, y - float(row) * gel.step_y)
+                            w = weight(gel.shear_spread, y - float(row) * gel.step_y)
                             pads.across[env, row, points] = w * force
                             if w > 0.0:
                                 span[0] = wp.min(span[0], row)
@@ -654,7 +641,7 @@ def sum_shear(
                         for group in range(groups):
                             four = wp.vec4f()
                             for i in range(4):
-                                four[i] = weight(gel.smear, x - float(4 * group + i) * gel.step_x)
+                                four[i] = weight(gel.shear_spread, x - float(4 * group + i) * gel.step_x)
                             pads.along[env, group, points] = four
                             if four[0] + four[1] + four[2] + four[3] > 0.0:
                                 span[2] = wp.min(span[2], group)

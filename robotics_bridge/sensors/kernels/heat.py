@@ -7,7 +7,10 @@ from __future__ import annotations
 
 from brainbench.core.devices import warp
 from robotics_bridge.physics.kernels.state import StateArrays
+from robotics_bridge.sensors.context import numbers_of
 from robotics_bridge.sensors.kernels.readout import ReadoutArrays
+from robotics_bridge.sensors.temperature.grid import TemperatureGrid
+from robotics_bridge.sensors.temperature.materials import ThermalMaterial
 
 wp = warp()
 # Contracted products would change how a level field rounds.
@@ -18,43 +21,24 @@ PIECES = 8  # a patch is cut into this many pieces along each of its two directi
 
 
 @wp.struct
+@numbers_of(TemperatureGrid, ThermalMaterial)
 class ThermalParams:
-    """One grid."""
+    """One grid, with the names and units of ``TemperatureGrid`` and of its ``ThermalMaterial``."""
 
     link: wp.int32
     """Number of the link that carries the grid."""
     first: wp.int32
     """Number of its first cell."""
-    shape: wp.vec3i
-    low: wp.vec3f
+    corner: wp.vec3f
     """Lower corner of the grid in the link's frame (m)."""
     cell: wp.vec3f
     """Edges of a cell (m)."""
-    conductivity: wp.float32
-    """W/(m K)."""
     diffusivity: wp.float32
     """m²/s."""
     capacity: wp.float32
     """Heat capacity of a cell (J/K)."""
-    emissivity: wp.float32
-    convection: wp.float32
-    """W/(m² K)."""
-    ambient: wp.float32
-    """°C."""
-    base: wp.float32
-    """°C, at a reset."""
-    contact: wp.float32
-    """Conductance of the bare interface (W/(m² K)); 0 is perfect."""
-    bluntness: wp.float32
-    """Radius R of the surfaces at a contact point (m)."""
-    depth_weight: wp.float32
     published: wp.int32
     """1: equations 4.38, 4.39; 0: the cell and the touched half-space in series."""
-    tau: wp.float32
-    """Time constant of the sensing element (s)."""
-    cold: wp.float32
-    """Range below the base in which the element reads (K)."""
-    warm: wp.float32
 
 
 @wp.struct
@@ -63,8 +47,6 @@ class HeatArrays:
 
     sensors: wp.array(dtype=ThermalParams)
     """[S]."""
-    part: wp.array(dtype=wp.int32)
-    """[N] number of the grid."""
     exposed: wp.array(dtype=wp.float32)
     """[N] outer surface of a cell (m²)."""
     source: wp.array(dtype=wp.float32)
@@ -207,8 +189,7 @@ def conductance_of(
     # Resistances in series: the cell, the interface, the touched body. A sum of resistances stays finite and positive
     # for any pair of materials.
     resistance = float(1.0) / (k_own * (float(1.0) / length + (float(1.0) - share) * rim(whole, spread)))
-    if grid.contact > float(0.0):
-        resistance = resistance + float(1.0) / grid.contact
+    resistance = resistance + float(1.0) / grid.contact_conductance
     # A half-space that gives heat through a disc: planar at first, spreading later.
     spread = root * wp.sqrt(heat.link_diffusivity[other])
     planar = float(1.0) / (spread * wp.sqrt(wp.pi))
@@ -246,7 +227,7 @@ def conduct_contacts(measure: int, state: StateArrays, heat: HeatArrays, io: Rea
             if wp.dot(side, state.contact_normal[c]) < float(0.0):
                 side = -side
             normal = normal + side
-            spots = spots + spot_area(state.contact_distance[d], grid.bluntness)
+            spots = spots + spot_area(state.contact_distance[d], grid.contact_radius)
             deepest = wp.max(deepest, -state.contact_distance[d])
     center = center / float(points)
     here = state.contact_position[c] - center
@@ -299,7 +280,7 @@ def conduct_contacts(measure: int, state: StateArrays, heat: HeatArrays, io: Rea
             filled = 1
     if grid.published == 1:
         # The published floor π d_w δ lacks a length; the radius supplies it.
-        floor = wp.pi * grid.depth_weight * wp.max(deepest, float(0.0)) * grid.bluntness
+        floor = wp.pi * grid.depth_weight * wp.max(deepest, float(0.0)) * grid.contact_radius
         if floor > whole:
             whole = floor
             area = floor / float(points)
@@ -325,8 +306,8 @@ def conduct_contacts(measure: int, state: StateArrays, heat: HeatArrays, io: Rea
         local = wp.transform_point(inverse, place)
         index = int(0)
         for axis in range(3):
-            cell = int(wp.floor((local[axis] - grid.low[axis]) / grid.cell[axis]))
-            index = index * grid.shape[axis] + wp.clamp(cell, 0, grid.shape[axis] - 1)
+            cell = int(wp.floor((local[axis] - grid.corner[axis]) / grid.cell[axis]))
+            index = index * grid.cells[axis] + wp.clamp(cell, 0, grid.cells[axis] - 1)
         index = grid.first + index
         if last >= 0 and (index != last or number == wp.static(PIECES * PIECES)):
             if measure == 1:
@@ -353,11 +334,11 @@ def mean_decay(x: wp.float64) -> wp.float64:
 def exchange_heat(heat: HeatArrays, io: ReadoutArrays, out: wp.array2d(dtype=wp.float64)):
     """Exchange heat with contacts, surroundings and source, exponentially. Thread: cell [B, N]."""
     env, n = wp.tid()
-    grid = heat.sensors[heat.part[n]]
+    grid = heat.sensors[io.part[n]]
     t = heat.temperature[env, n]
     begins = heat.begins == 1 and io.age[env] == 0
     if begins:
-        t = wp.float64(grid.base)
+        t = wp.float64(grid.base_temperature)
     g = heat.conductance[env, n]
     inflow = heat.inflow[env, n]
     heat.covered[env, n] = float(0.0)
@@ -369,7 +350,7 @@ def exchange_heat(heat: HeatArrays, io: ReadoutArrays, out: wp.array2d(dtype=wp.
     past = wp.where(begins, float(0.0), heat.touched[env, n])
     heat.touched[env, n] = wp.where(g > float(0.0), past + io.dt, float(0.0))
     # Steps as short as 1e-5 s change less than single precision can hold.
-    surroundings = grid.ambient + float(273.15)
+    surroundings = grid.ambient_temperature + float(273.15)
     start = t
     step = wp.float64(io.dt) / wp.float64(grid.capacity)
     # Radiation through its secant, q = G (T − T_ambient), taken half way on the second pass.
@@ -379,7 +360,7 @@ def exchange_heat(heat: HeatArrays, io: ReadoutArrays, out: wp.array2d(dtype=wp.
         loss = heat.exposed[n] * (grid.convection + radiation * (kelvin + surroundings))
         total = wp.float64(g + loss)
         power = wp.float64(inflow) - wp.float64(g) * start + wp.float64(heat.source[n])
-        power = power + wp.float64(loss) * (wp.float64(grid.ambient) - start)
+        power = power + wp.float64(loss) * (wp.float64(grid.ambient_temperature) - start)
         # Exact solution of C dT/dt = P − G (T − T₀) over the step with constant G: a large step ends at the balance,
         # which forward Euler (4.36, 4.39) overshoots.
         t = start + power * step * mean_decay(total * step)
@@ -388,20 +369,21 @@ def exchange_heat(heat: HeatArrays, io: ReadoutArrays, out: wp.array2d(dtype=wp.
 
 @wp.kernel
 def diffuse_heat(
-    axis: int, heat: HeatArrays, temperature: wp.array2d(dtype=wp.float64), out: wp.array2d(dtype=wp.float64)
-):
+    axis: int, heat: HeatArrays, io: ReadoutArrays, temperature: wp.array2d(dtype=wp.float64),
+    out: wp.array2d(dtype=wp.float64),
+):  # fmt: skip
     """Spread heat along one axis by a matrix [n, n] that was exponentiated beforehand. Thread: cell [B, N]."""
     env, n = wp.tid()
-    grid = heat.sensors[heat.part[n]]
-    length = grid.shape[axis]
+    grid = heat.sensors[io.part[n]]
+    length = grid.cells[axis]
     stride = 1
     if axis == 0:
-        stride = grid.shape[1] * grid.shape[2]
+        stride = grid.cells[1] * grid.cells[2]
     if axis == 1:
-        stride = grid.shape[2]
+        stride = grid.cells[2]
     row = ((n - grid.first) // stride) % length
     start = n - row * stride
-    base = heat.offset[heat.part[n], axis] + row * length
+    base = heat.offset[io.part[n], axis] + row * length
     # Differences from the cell's own value: a level field stays level to the last digit.
     own = temperature[env, n]
     # Row of the matrix exponential of insulated diffusion: stable at any Δt and free of loss, unlike 4.35.
@@ -415,7 +397,7 @@ def diffuse_heat(
 def sense_temperature(heat: HeatArrays, io: ReadoutArrays, fresh: wp.array2d(dtype=wp.float64)):
     """Keep the new field, let the sensing element follow it, and write both readings. Thread: cell [B, N]."""
     env, n = wp.tid()
-    grid = heat.sensors[heat.part[n]]
+    grid = heat.sensors[io.part[n]]
     t = fresh[env, n]
     earlier = heat.temperature[env, n]
     heat.temperature[env, n] = t
@@ -425,13 +407,14 @@ def sense_temperature(heat: HeatArrays, io: ReadoutArrays, fresh: wp.array2d(dty
     if grid.tau > float(0.0):
         before = heat.element[env, n]
         if heat.begins == 1 and io.age[env] == 0:
-            before = wp.float64(grid.base)
+            before = wp.float64(grid.base_temperature)
             earlier = before
         part_of = wp.float64(io.dt) / wp.float64(grid.tau)
         held = mean_decay(part_of)
         lagged = t + (before - earlier) * (wp.float64(1.0) - part_of * held) - (t - earlier) * held
         heat.element[env, n] = lagged
-    seen = grid.base + wp.clamp(float(lagged - wp.float64(grid.base)), -grid.cold, grid.warm)
+    above = float(lagged - wp.float64(grid.base_temperature))
+    seen = grid.base_temperature + wp.clamp(above, -grid.cold_range, grid.warm_range)
     true = float(t)
     # What an environment that diverged reads is marked; its field waits.
     if (io.status[env] & 1) != 0:

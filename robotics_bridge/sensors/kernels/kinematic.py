@@ -12,6 +12,7 @@ from functools import cache
 from typing import Any
 
 from brainbench.core.devices import warp
+from robotics_bridge.sensors.context import numbers_of
 from robotics_bridge.sensors.kernels.contact_load import ContactFaces, SpreadPlan
 from robotics_bridge.sensors.kernels.distance import FAR, SIDED, SolidArrays, SolidShape, shape_functions
 from robotics_bridge.sensors.kernels.noise import NoiseParams, episode_draw, radius_noise
@@ -31,6 +32,7 @@ from robotics_bridge.sensors.kernels.readout import (
     silenced,
     store_planes,
 )
+from robotics_bridge.sensors.taxels.sensors import KinematicTaxel
 
 wp = warp()
 
@@ -95,16 +97,12 @@ BLOCKS_SINGLE = 4  # the same where every row is one taxel, except for ray casts
 
 
 @wp.struct
+@numbers_of(KinematicTaxel)
 class KinematicParams:
-    """Law of one force field; units as in ``KinematicTaxel``."""
+    """Law of one force field, with the names and units of ``KinematicTaxel``."""
 
-    stiffness: wp.float32
-    damping: wp.float32
-    exponent: wp.float32
-    shear: wp.float32
-    twist: wp.float32
+    torsion: wp.float32
     friction: wp.float32
-    grip: wp.float32
 
 
 @cache
@@ -134,7 +132,7 @@ def kinematic_function(physical: bool, sticky: bool, fast: bool = False) -> Any:
         approach = wp.dot(relative, normal)
         tangential = relative - approach * normal
         push = s * (p.stiffness + p.damping * approach)
-        turn = p.twist * wp.dot(spin, normal)
+        turn = p.torsion * wp.dot(spin, normal)
         f = wp.vec3f(0.0)
         if wp.static(sticky):
             f = wp.max(push, 0.0) * (normal + sigma)
@@ -284,7 +282,7 @@ def kinematic_kernel(
                 fixed = wp.vec3f()
                 noisy = float(0.0)
                 if wp.static(mode != CLEAN):
-                    probe = probes.probe[n]
+                    probe = io.probe[n]
                     noisy = wp.max(radius + radius_noise(knobs, number, probe, age, episode), 0.0) - best
                     fixed = episode_draw(knobs, number, probe, episode)
                     noisy = noisy * fixed[0]
@@ -358,12 +356,12 @@ def measure_kernel(hysteresis: bool, walk: bool) -> Any:
             return
         age = io.age[env]
         lag, drift = recall_six(io, env, n, age)
-        part = probes.part[n]
+        part = io.part[n]
         # What nothing touches was not written.
         signal = wp.spatial_vectorf()
         if press.filled[env, n] != wp.uint8(0):
             signal = load_planes(io.measured, env, n, 6)
-        probe = probes.probe[n]
+        probe = io.probe[n]
         fixed = episode_draw(io.knobs[part], env + io.env_offset, probe, io.episode[env])
         emit_six(io, io.knobs[part], env, n, probe, age, io.episode[env], fixed, lag, drift, signal, signal)
 

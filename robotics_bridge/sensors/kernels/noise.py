@@ -14,6 +14,8 @@ from __future__ import annotations
 from typing import Any
 
 from brainbench.core.devices import warp
+from robotics_bridge.sensors.context import numbers_of
+from robotics_bridge.sensors.noise.model import Noise
 
 wp = warp()
 
@@ -69,29 +71,12 @@ PAIRS = 256 - CHANNELS  # purposes of pairs of channels
 
 
 @wp.struct
+@numbers_of(Noise)
 class NoiseParams:
-    """The knobs of one sensor."""
+    """The knobs of one sensor, with the names and units of ``Noise``."""
 
     key_low: wp.uint32
     key_high: wp.uint32
-    radius: wp.float32
-    """Half width of the uniform error of the sensing radius [m]."""
-    gain_low: wp.float32
-    gain_high: wp.float32
-    dead_probability: wp.float32
-    dead_low: wp.float32
-    dead_high: wp.float32
-    hysteresis: wp.float32
-    """Strength β."""
-    tau: wp.float32
-    """Time constant of the hysteresis [s]."""
-    walk: wp.float32
-    """Standard deviation of one step of the random walk [output unit]."""
-    white: wp.float32
-    """Standard deviation of the white noise [output unit]."""
-    bias: wp.float32
-    quantum: wp.float32
-    """Step of the quantisation [output unit]; 0 is none."""
     levels: wp.float32
     """1 / quantum, where there is one."""
 
@@ -194,15 +179,15 @@ def pair_normals(p: NoiseParams, env: int, probe: int, pair: int, age: int, epis
 @wp.func
 def episode_draw(p: NoiseParams, env: int, probe: int, episode: int) -> wp.vec3:
     """Return what holds for an episode: (gain γ of 4.24, 1 if the probe is dead, the value it is stuck at)."""
-    out = wp.vec3(p.gain_low, float(0.0), float(0.0))
-    if p.gain_high > p.gain_low or p.dead_probability > float(0.0):
+    out = wp.vec3(p.gain[0], float(0.0), float(0.0))
+    if p.gain[1] > p.gain[0] or p.dead_probability > float(0.0):
         # Age 0 in the counter: the same numbers in every update of the episode, without storing them.
         w0, w1, w2, _w3 = draw(p, env, probe, 0, episode, wp.static(EPISODE))
-        if p.gain_high > p.gain_low:
-            out[0] = p.gain_low + (p.gain_high - p.gain_low) * uniform(w0)
+        if p.gain[1] > p.gain[0]:
+            out[0] = p.gain[0] + (p.gain[1] - p.gain[0]) * uniform(w0)
         if uniform(w1) < p.dead_probability:
             out[1] = float(1.0)
-            out[2] = p.dead_low + (p.dead_high - p.dead_low) * uniform(w2)
+            out[2] = p.dead_range[0] + (p.dead_range[1] - p.dead_range[0]) * uniform(w2)
     return out
 
 
@@ -244,86 +229,99 @@ def apply_drawn(
     return wp.vec3(wp.where(finite, y, x), wp.where(finite, lag, hysteresis_state), wp.where(finite, drift, walk_state))
 
 
+@wp.struct
+class ReadoutArrays:
+    """Readings of a group, their noise and the clock of its environments."""
+
+    truth: wp.array3d(dtype=wp.float32)
+    """[C, B, N] unit of the sensor."""
+    measured: wp.array3d(dtype=wp.float32)
+    """[C, B, N]; the same array as ``truth`` where there is no noise."""
+    hysteresis: wp.array3d(dtype=wp.float32)
+    """[C, B, N] memory of the hysteresis, if it is stored."""
+    walk: wp.array3d(dtype=wp.float32)
+    """[C, B, N] drift, if it is stored."""
+    age: wp.array(dtype=wp.int32)
+    """[B] updates since the reset, 0 at the first."""
+    episode: wp.array(dtype=wp.int32)
+    """[B] resets so far."""
+    status: wp.array(dtype=wp.int32)
+    """[B] bits of the suite; 1 is diverged."""
+    knobs: wp.array(dtype=NoiseParams)
+    """[S] noise of each sensor."""
+    part: wp.array(dtype=wp.int32)
+    """[N] number of the sensor."""
+    probe: wp.array(dtype=wp.int32)
+    """[N] number within the sensor."""
+    env_offset: wp.int32
+    """Number of environment 0 in the whole experiment."""
+    dt: wp.float32
+    """Time step (s)."""
+
+
 @wp.kernel
-def measure(
-    p: wp.array(dtype=NoiseParams),
-    part: wp.array(dtype=wp.int32),
-    probe: wp.array(dtype=wp.int32),
-    active: wp.array(dtype=wp.int32),
-    age: wp.array(dtype=wp.int32),
-    episode: wp.array(dtype=wp.int32),
-    env_offset: int,
-    dt: float,
-    gained: int,
-    x: wp.array3d(dtype=wp.float32),
-    hysteresis: wp.array3d(dtype=wp.float32),
-    walk: wp.array3d(dtype=wp.float32),
-    out: wp.array3d(dtype=wp.float32),
-):
+def measure(io: ReadoutArrays, active: wp.array(dtype=wp.int32), gained: int, x: wp.array3d(dtype=wp.float32)):
     """Measure a whole reading ``x`` [C, B, N]; ``gained`` 1: the sensor has applied the gain. Thread: [B, N]."""
     env, n = wp.tid()
     if active[n] == 0:
         for channel in range(x.shape[0]):
-            out[channel, env, n] = float(0.0)
+            io.measured[channel, env, n] = float(0.0)
         return
-    knobs = p[part[n]]
+    knobs = io.knobs[io.part[n]]
+    probe = io.probe[n]
+    age = io.age[env]
+    episode = io.episode[env]
     # Numbers belong to the environment of the whole experiment: splitting it over devices does not change them.
-    number = env_offset + env
-    fixed = episode_draw(knobs, number, probe[n], episode[env])
+    number = io.env_offset + env
+    fixed = episode_draw(knobs, number, probe, episode)
     scale = wp.where(gained == 0, fixed[0], float(1.0))
     fading = float(0.0)
     if knobs.hysteresis != float(0.0):
-        fading = decay(dt / knobs.tau)
+        fading = decay(io.dt / knobs.hysteresis_tau)
     z = wp.vec4()
     for channel in range(x.shape[0]):
         # One call of Philox yields four words: white noise and drift of two neighbouring channels.
         if channel % 2 == 0 and (knobs.white > float(0.0) or knobs.walk > float(0.0)):
-            z = pair_normals(knobs, number, probe[n], channel // 2, age[env], episode[env])
+            z = pair_normals(knobs, number, probe, channel // 2, age, episode)
         white = wp.where(channel % 2 == 0, z[0], z[2])
         step = wp.where(channel % 2 == 0, z[1], z[3])
         lag = float(0.0)
         drift = float(0.0)
-        if age[env] > 0:
-            if hysteresis.shape[1] > 0:
-                lag = hysteresis[channel, env, n]
-            if walk.shape[1] > 0:
-                drift = walk[channel, env, n]
+        if age > 0:
+            if io.hysteresis.shape[1] > 0:
+                lag = io.hysteresis[channel, env, n]
+            if io.walk.shape[1] > 0:
+                drift = io.walk[channel, env, n]
         y = apply_drawn(knobs, scale * x[channel, env, n], white, step, fixed, fading, lag, drift)
-        out[channel, env, n] = y[0]
-        if hysteresis.shape[1] > 0:
-            hysteresis[channel, env, n] = y[1]
-        if walk.shape[1] > 0:
-            walk[channel, env, n] = y[2]
+        io.measured[channel, env, n] = y[0]
+        if io.hysteresis.shape[1] > 0:
+            io.hysteresis[channel, env, n] = y[1]
+        if io.walk.shape[1] > 0:
+            io.walk[channel, env, n] = y[2]
 
 
 @wp.kernel
 def crosstalk(
-    along: int,
-    signal: wp.array3d(dtype=wp.float32),
-    value: wp.array3d(dtype=wp.float32),
-    part: wp.array(dtype=wp.int32),
-    probe: wp.array(dtype=wp.int32),
-    shape: wp.array2d(dtype=wp.int32),
-    strength: wp.array(dtype=wp.float32),
-    weights: wp.array2d(dtype=wp.float32),
-    out: wp.array3d(dtype=wp.float32),
-):
+    along: int, io: ReadoutArrays, value: wp.array3d(dtype=wp.float32), shape: wp.array2d(dtype=wp.int32),
+    weights: wp.array2d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32),
+):  # fmt: skip
     """Compute one half of the crosstalk (4.28), zero outside the grid. Thread: channel, environment, probe [C, B, N].
 
     Launched along the rows into a buffer, then along the columns, where the signal is mixed in.
     """
     channel, env, n = wp.tid()
-    i = part[n]
+    i = io.part[n]
+    strength = io.knobs[i].crosstalk
     x = value[channel, env, n]
-    if strength[i] <= float(0.0):
+    if strength <= float(0.0):
         out[channel, env, n] = x
         return
     columns = shape[i, 1]
-    place = probe[n] % columns
+    place = io.probe[n] % columns
     length = columns
     stride = 1
     if along == 0:
-        place = probe[n] // columns
+        place = io.probe[n] // columns
         length = shape[i, 0]
         stride = columns
     # The Gaussian G of 4.28 is a product of weights along rows and columns: two passes cost 2 K, not K², per probe.
@@ -337,36 +335,25 @@ def crosstalk(
             total = total + weights[i, k] * value[channel, env, n - k * stride]
     if along == 0:
         # (1 − χ) z + χ (G ∗ z), mixed only after the second pass.
-        total = (float(1.0) - strength[i]) * signal[channel, env, n] + strength[i] * total
+        total = (float(1.0) - strength) * io.measured[channel, env, n] + strength * total
     out[channel, env, n] = total
 
 
 @wp.kernel
-def delay_line(
-    p: wp.array(dtype=NoiseParams),
-    part: wp.array(dtype=wp.int32),
-    delay: wp.array(dtype=wp.float32),
-    jitter: wp.array(dtype=wp.float32),
-    age: wp.array(dtype=wp.int32),
-    episode: wp.array(dtype=wp.int32),
-    env_offset: int,
-    dt: float,
-    value: wp.array3d(dtype=wp.float32),
-    ring: wp.array4d(dtype=wp.float32),
-    out: wp.array3d(dtype=wp.float32),
-):
+def delay_line(io: ReadoutArrays, ring: wp.array4d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32)):
     """Record a reading and read an earlier one (zero-order hold). Thread: environment and probe [B, N]."""
     env, n = wp.tid()
-    i = part[n]
-    wait = delay[i]
-    if jitter[i] > float(0.0):
-        w0, _w1, _w2, _w3 = draw(p[i], env_offset + env, -1, age[env], episode[env], wp.static(JITTER))
-        wait = wait + jitter[i] * (float(2.0) * uniform(w0) - float(1.0))
+    knobs = io.knobs[io.part[n]]
+    age = io.age[env]
+    wait = knobs.read_delay
+    if knobs.jitter > float(0.0):
+        w0, _w1, _w2, _w3 = draw(knobs, io.env_offset + env, -1, age, io.episode[env], wp.static(JITTER))
+        wait = wait + knobs.jitter * (float(2.0) * uniform(w0) - float(1.0))
     size = ring.shape[0]
     # The last reading at or before the moment; before the first has arrived, the first.
-    back = wp.min(wp.min(int(wp.ceil(wait / dt - float(1.0e-4))), age[env]), size - 1)
-    for channel in range(value.shape[0]):
+    back = wp.min(wp.min(int(wp.ceil(wait / io.dt - float(1.0e-4))), age), size - 1)
+    for channel in range(out.shape[0]):
         # Written before it is read: a delay of zero returns this update. What is stored is the measured value, so a
         # delayed reading keeps the noise it was recorded with.
-        ring[age[env] % size, channel, env, n] = value[channel, env, n]
-        out[channel, env, n] = ring[(age[env] - back) % size, channel, env, n]
+        ring[age % size, channel, env, n] = io.measured[channel, env, n]
+        out[channel, env, n] = ring[(age - back) % size, channel, env, n]

@@ -94,8 +94,8 @@ def probe_kernel(kinds: frozenset[int], raycast: bool, reads: str, mode: int, hy
         radius = probes.radius[n]
         if silenced(io, 1, env, n, radius):
             return
-        part = probes.part[n]
-        probe = probes.probe[n]
+        part = io.part[n]
+        probe = io.probe[n]
         age = io.age[env]
         episode = io.episode[env]
         best, _normal, place = deepest(probes, solids, pairs, env, n, wp.static(FAR if distance else 0.0))

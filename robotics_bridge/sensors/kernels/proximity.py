@@ -10,6 +10,7 @@ from typing import Any
 
 from brainbench.core.devices import warp
 from robotics_bridge.physics.kernels.state import StateArrays
+from robotics_bridge.sensors.context import numbers_of
 from robotics_bridge.sensors.kernels.noise import episode_draw, radius_noise
 from robotics_bridge.sensors.kernels.pairs import PairArrays
 from robotics_bridge.sensors.kernels.readout import (
@@ -20,6 +21,7 @@ from robotics_bridge.sensors.kernels.readout import (
     readout_functions,
     silenced,
 )
+from robotics_bridge.sensors.taxels.sensors import ProximityTaxel
 
 wp = warp()
 
@@ -61,11 +63,9 @@ class CellArrays:
 
 
 @wp.struct
+@numbers_of(ProximityTaxel)
 class ProximityParams:
-    """Law of one taxel sensor; units as in ``ProximityTaxel``."""
-
-    stiffness: wp.float32
-    coupling: wp.float32
+    """Law of one taxel sensor, with the names and units of ``ProximityTaxel``."""
 
 
 @wp.struct
@@ -132,8 +132,8 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool) ->
         if not silenced(io, 6, env, n, radius):
             row = env % cells.shape.shape[0]
             slot = probes.slot[n]
-            part = probes.part[n]
-            probe = probes.probe[n]
+            part = io.part[n]
+            probe = io.probe[n]
             x = probes.position[n]
             age = io.age[env]
             episode = io.episode[env]

@@ -9,7 +9,14 @@ from functools import cache
 from types import SimpleNamespace
 
 from brainbench.core.devices import warp
-from robotics_bridge.sensors.kernels.noise import NoiseParams, apply_drawn, decay, episode_draw, pair_normals
+from robotics_bridge.sensors.kernels.noise import (
+    NoiseParams,
+    ReadoutArrays,
+    apply_drawn,
+    decay,
+    episode_draw,
+    pair_normals,
+)
 
 wp = warp()
 
@@ -120,36 +127,6 @@ class ProbeArrays:
     """[N] position and radius once more, for kernels that read them in one access."""
     slot: wp.array(dtype=wp.int32)
     """[N] slot of the pair lists."""
-    part: wp.array(dtype=wp.int32)
-    """[N] number of the sensor."""
-    probe: wp.array(dtype=wp.int32)
-    """[N] number within the sensor."""
-
-
-@wp.struct
-class ReadoutArrays:
-    """Readings of a group, their noise and the clock of its environments."""
-
-    truth: wp.array3d(dtype=wp.float32)
-    """[C, B, N] unit of the sensor."""
-    measured: wp.array3d(dtype=wp.float32)
-    """[C, B, N]; the same array as ``truth`` where there is no noise."""
-    hysteresis: wp.array3d(dtype=wp.float32)
-    """[C, B, N] memory of the hysteresis, if it is stored."""
-    walk: wp.array3d(dtype=wp.float32)
-    """[C, B, N] drift, if it is stored."""
-    age: wp.array(dtype=wp.int32)
-    """[B] updates since the reset, 0 at the first."""
-    episode: wp.array(dtype=wp.int32)
-    """[B] resets so far."""
-    status: wp.array(dtype=wp.int32)
-    """[B] bits of the suite; 1 is diverged."""
-    knobs: wp.array(dtype=NoiseParams)
-    """[S] noise of each sensor."""
-    env_offset: wp.int32
-    """Number of environment 0 in the whole experiment."""
-    dt: wp.float32
-    """Time step (s)."""
 
 
 @wp.struct
@@ -250,7 +227,7 @@ def readout_functions(
             fading = float(0.0)
             if wp.static(hysteresis):
                 if knobs.hysteresis != 0.0:
-                    fading = decay(io.dt / knobs.tau)
+                    fading = decay(io.dt / knobs.hysteresis_tau)
             # Channels go in pairs because one Philox call gives the four normal numbers that two of them need: (white,
             # walk) of the even channel, then of the odd one. Calls next to each other share the schedule of their key.
             z = Normals()

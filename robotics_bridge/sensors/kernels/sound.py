@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from brainbench.core.devices import warp
 from robotics_bridge.physics.kernels.state import StateArrays, in_scene
+from robotics_bridge.sensors.audio.sensors import ActuationAudio, ContactAudio
+from robotics_bridge.sensors.context import numbers_of
 from robotics_bridge.sensors.kernels.noise import draw, normals
 from robotics_bridge.sensors.kernels.readout import ReadoutArrays
 
@@ -16,17 +18,13 @@ SCRAPE, FRICTION = 200, 201  # purposes of random numbers: sliding contact, fric
 
 
 @wp.struct
+@numbers_of(ContactAudio)
 class SourceParams:
-    """One source of contact sound."""
+    """One source of contact sound, with the names and units of ``ContactAudio``."""
 
     link: wp.int32
     key_low: wp.uint32
     key_high: wp.uint32
-    threshold: wp.float32
-    """Rise of force in one update that counts as an impact (N)."""
-    impact: wp.float32
-    scrape: wp.float32
-    """Force noise per force and speed (N per N m/s)."""
     pulse: wp.int32
     """Samples over which an impact spreads."""
 
@@ -159,20 +157,12 @@ def ring_modes(own: ContactSoundArrays, io: ReadoutArrays, samples: int):
 
 
 @wp.struct
+@numbers_of(ActuationAudio)
 class DriveSoundParams:
-    """Sound of the drives of one sensor; as in ``ActuationAudio``."""
+    """Sound of the drives of one sensor, with the names and units of ``ActuationAudio``."""
 
     key_low: wp.uint32
     key_high: wp.uint32
-    load: wp.float32
-    power: wp.float32
-    pitch: wp.float32
-    """Frequency of the fundamental per speed (Hz per rad/s)."""
-    partials: wp.int32
-    rolloff: wp.float32
-    friction: wp.float32
-    hum: wp.float32
-    hum_frequency: wp.float32
 
 
 @wp.struct
@@ -181,10 +171,6 @@ class DriveSoundArrays:
 
     settings: wp.array(dtype=DriveSoundParams)
     """One per sensor."""
-    part: wp.array(dtype=wp.int32)
-    """[J] number of the sensor."""
-    number: wp.array(dtype=wp.int32)
-    """[J] number of the joint within it."""
     effort: wp.array2d(dtype=wp.float32)
     """[B, J] torque (N m), written by the user."""
     speed: wp.array2d(dtype=wp.float32)
@@ -203,7 +189,7 @@ class DriveSoundArrays:
 def sound_drives(own: DriveSoundArrays, io: ReadoutArrays, samples: int):
     """Sound the drives (4.34): partials of the mesh frequency, friction noise and hum. Thread: joint [B, J]."""
     env, j = wp.tid()
-    d = own.settings[own.part[j]]
+    d = own.settings[io.part[j]]
     loud = d.load * wp.abs(own.effort[env, j]) + d.power * wp.abs(own.effort[env, j] * own.speed[env, j])
     fast = wp.abs(own.speed[env, j])
     fresh = io.age[env] == 0
@@ -230,7 +216,7 @@ def sound_drives(own: DriveSoundArrays, io: ReadoutArrays, samples: int):
             weight = weight * d.rolloff
         value = (loud0 + share * (loud - loud0)) * tone
         if d.friction > float(0.0) and now > float(0.0):
-            at = own.number[j] + k * 4096
+            at = io.probe[j] + k * 4096
             w0, w1, _w2, _w3 = draw(d, io.env_offset + env, at, io.age[env], io.episode[env], wp.static(FRICTION))
             z = normals(w0, w1)
             value = value + d.friction * now * z[0]

@@ -13,17 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.devices import pick_device, warp
+from brainbench.core.devices import pick_device
 from brainbench.core.errors import UsageError, check_number
 from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice, fill
-from robotics_bridge.sensors.kernels.noise import NoiseParams, crosstalk, delay_line, measure
+from robotics_bridge.sensors.kernels.noise import NoiseParams, ReadoutArrays, crosstalk, delay_line, measure
+from robotics_bridge.sensors.kernels.readout import CLEAN, FUSED, STAGED
 from robotics_bridge.sensors.noise.model import Noise, stream_key
-
-wp = warp()
 
 
 class ReadingNoise:
-    """Noise of the sensors that share planar arrays: what their own kernel leaves to stages, and the delay.
+    """Readings of the sensors that share planar arrays, and their noise: what a sensor's kernel leaves, and the delay.
 
     It needs no reset: what belongs to an environment whose ``age`` is 0 counts as zero. A late reading (held until the
     next) carries the noise it was recorded with; before the first one after a reset has arrived, the first is read.
@@ -32,7 +31,8 @@ class ReadingNoise:
         slices: The sensors, one after another on N.
         channels: C.
         context: Device, clock and seed.
-        staged: Crosstalk and everything up to dead probes are applied here; otherwise the sensors' kernel does it.
+        fusable: The sensors' kernel applies the noise itself where no crosstalk forbids it; otherwise it is applied
+            here, up to dead probes.
         gained: The sensors apply the gain themselves; otherwise it multiplies the signal here.
     """
 
@@ -42,35 +42,46 @@ class ReadingNoise:
         channels: int,
         context: LaunchContext,
         *,
-        staged: bool,
+        fusable: bool = True,
         gained: bool = True,
     ) -> None:
-        self._slices, self._context, self._staged, self._gained = slices, context, staged, gained
+        self._slices, self._context, self._gained = slices, context, gained
         total, noises = sum(part.count for part in slices), [part.noise for part in slices]
         self._shape = (channels, context.num_envs, total)
+        noisy = any(noise.active for noise in noises)
+        # Crosstalk needs the values of neighbours, which threads of one kernel cannot have; all other noise is fused.
+        self._mixes = any(noise.crosstalk for noise in noises)
+        self.mode = CLEAN if not noisy else FUSED if fusable and not self._mixes else STAGED
+        lasting = noisy and any(noise.hysteresis for noise in noises), noisy and any(noise.walk for noise in noises)
+        self.stores = (self.mode == FUSED and lasting[0], self.mode == FUSED and lasting[1])
+        """True for hysteresis, and for drift, that the sensor's kernel keeps."""
         index, probe, active = (np.zeros(total, np.int32) for _ in range(3))
         for number, part in enumerate(slices):
             index[part.span], probe[part.span] = number, np.arange(part.count)
             active[part.span] = 1 if part.active is None else part.active
-        self.part, self.probe, self._active = (context.array(item, int) for item in (index, probe, active))
-        """Warp arrays [N]: number of the sensor, number of the probe within it, 0 for fillers."""
-        self.params = self._draw_keys()
-        """Warp array [S] of the knobs."""
-        self._hysteresis = self._zeros(staged and any(noise.hysteresis for noise in noises))
-        self._walk = self._zeros(staged and any(noise.walk for noise in noises))
-        self._mixes = staged and any(noise.crosstalk for noise in noises)
+        io = ReadoutArrays()
+        io.truth = self._zeros(True)
+        io.measured = self._zeros(True) if noisy else io.truth
+        io.hysteresis, io.walk = map(self._zeros, lasting)
+        io.part, io.probe, self._active = (context.array(numbers, int) for numbers in (index, probe, active))
+        io.age, io.episode, io.env_offset = context.age, context.episode, context.env_offset
+        io.knobs = self._draw_keys()
+        self.io = io
+        """Warp structure of readings, knobs and clock."""
         self._buffers = [self._zeros(self._mixes) for _ in range(2)]
-        self.lasting = [self._hysteresis, self._walk, *self._buffers]
-        """Warp arrays of the memory, without the delay."""
         if self._mixes:
             self._crosstalk = self._prepare_crosstalk()
-        self._delay = context.array([noise.read_delay for noise in noises], float)
-        self._jitter = context.array([noise.jitter for noise in noises], float)
         self._longest = max(noise.read_delay + noise.jitter for noise in noises)
-        self.late, self._ring = self._zeros(self._longest > 0), None
-        """Warp array of late readings; empty without a delay."""
-        self.rings = [self.late]
+        self._late, self._ring = self._zeros(self._longest > 0), None
+        self.rings = [self._late]
         """Warp arrays of the delay; its ring exists from the first launch on."""
+        self.memory = [*self.readable[:-1], io.hysteresis, io.walk, *self._buffers]
+        """Warp arrays that later updates depend on, without the delay."""
+
+    @property
+    def readable(self) -> list[Any]:
+        """Warp arrays that can be read."""
+        return [self.io.truth, *([self.io.measured] if self.io.measured is not self.io.truth else []), self._late]
 
     def _draw_keys(self) -> Any:
         structures = [noise_params(part.noise, self._context.seed, part.name) for part in self._slices]
@@ -79,15 +90,14 @@ class ReadingNoise:
     def seed(self) -> None:
         """Draw from the context's present seed from now on."""
         # Into the same memory, which recorded launches keep the address of.
-        self.params.assign(self._draw_keys())
+        self.io.knobs.assign(self._draw_keys())
 
     def _zeros(self, wanted: bool, leading: tuple[int, ...] = ()) -> Any:
         """Return [..., C, B, N] zeros, or an empty array when they are not wanted."""
         return self._context.zeros((*leading, *self._shape) if wanted else (0, 0, 0))
 
-    def _prepare_crosstalk(self) -> tuple[Any, Any, Any]:
-        slices, context = self._slices, self._context
-        mixed = {number: part for number, part in enumerate(slices) if part.noise.crosstalk}
+    def _prepare_crosstalk(self) -> tuple[Any, Any]:
+        mixed = {number: part for number, part in enumerate(self._slices) if part.noise.crosstalk}
         for part in mixed.values():
             if len(part.layout) != 2:
                 raise UsageError(
@@ -96,31 +106,25 @@ class ReadingNoise:
                 )
         # One array for all sensors: shorter kernels are padded with zeros.
         half = max(math.ceil(4 * part.noise.crosstalk_sigma) for part in mixed.values())
-        weights = np.zeros((len(slices), half + 1), np.float32)
-        shape, strength = np.ones((len(slices), 2), np.int32), np.zeros(len(slices), np.float32)
+        weights = np.zeros((len(self._slices), half + 1), np.float32)
+        shape = np.ones((len(self._slices), 2), np.int32)
         for row, part in mixed.items():
-            weights[row] = gaussian_weights(part.noise.crosstalk_sigma, half)
-            shape[row], strength[row] = part.layout, part.noise.crosstalk
-        return context.array(shape, int), context.array(strength, float), context.array(weights, float)
+            weights[row], shape[row] = gaussian_weights(part.noise.crosstalk_sigma, half), part.layout
+        return self._context.array(shape, int), self._context.array(weights, float)
 
-    def launch(self, x: Any, out: Any, dt: float) -> None:
-        """Measure the signal ``x`` [C, B, N] (after radius noise) into ``out`` if that is staged; record ``out``."""
-        context = self._context
-        knobs, now = [self.params, self.part], [context.age, context.episode, context.env_offset, float(dt)]
+    def launch(self, dt: float) -> None:
+        """Apply to ``io.measured`` what is left of the noise, ``dt`` seconds after the last time, and record it."""
+        context, io = self._context, self.io
+        io.dt, signal = dt, io.measured
         if self._mixes:
-            first, second = self._buffers
             # Rows into one buffer, columns into the other: threads read neighbours, so no pass writes what it reads.
-            for along, source, target in ((1, x, first), (0, first, second)):
-                context.launch(
-                    crosstalk, self._shape, along, x, source, self.part, self.probe, *self._crosstalk, target
-                )
-            x = second
-        if self._staged:
-            inputs = [*knobs, self.probe, self._active, *now, int(self._gained), x, self._hysteresis, self._walk, out]
-            context.launch(measure, self._shape[1:], *inputs)
+            for along, buffer in zip((1, 0), self._buffers, strict=True):
+                context.launch(crosstalk, self._shape, along, io, signal, *self._crosstalk, buffer)
+                signal = buffer
+        if self.mode == STAGED:
+            context.launch(measure, self._shape[1:], io, self._active, int(self._gained), signal)
         if self._longest > 0:
-            inputs = [*knobs, self._delay, self._jitter, *now, out, self.make_room(dt), self.late]
-            context.launch(delay_line, self._shape[1:], *inputs)
+            context.launch(delay_line, self._shape[1:], io, self.make_room(dt), self._late)
 
     def make_room(self, dt: float) -> Any:
         """Return the ring of readings that are late, made for steps of ``dt`` (s) the first time; None without any."""
@@ -136,16 +140,14 @@ class ReadingNoise:
             )
         return self._ring
 
-    def read(self, measured: Any) -> Any:
-        """Return what is read where ``measured`` [C, B, N] is newest: an earlier reading if there is a delay."""
-        return self.late if self._longest > 0 else measured
+    def read(self) -> Any:
+        """Return the planar array [C, B, N] that is read: an earlier reading than the newest if there is a delay."""
+        return self._late if self._longest > 0 else self.io.measured
 
 
 def noise_params(noise: Noise, seed: int, name: str) -> Any:
     """Return the Warp structure ``NoiseParams`` of the sensor ``name`` in an experiment."""
-    ranges = dict(zip(("gain_low", "gain_high", "dead_low", "dead_high"), noise.gain + noise.dead_range, strict=True))
-    levels = 1.0 / noise.quantum if noise.quantum else 0.0
-    return fill(NoiseParams, noise, tau=noise.hysteresis_tau, levels=levels, **stream_key(seed, name), **ranges)
+    return fill(NoiseParams, noise, levels=1.0 / noise.quantum if noise.quantum else 0.0, **stream_key(seed, name))
 
 
 def gaussian_weights(sigma: float, half: int) -> NDArray[np.float64]:
@@ -189,10 +191,10 @@ def simulate(
     where = pick_device(device)
     slices = [ReadoutSlice(name, replace(noise, radius=0.0), 0, layout)]
     context = LaunchContext(envs, where, seed, env_offset)
-    stages = ReadingNoise(slices, channels, context, staged=True, gained=False)
-    measured, out = context.zeros((channels, envs, probes)), np.empty_like(frames)
+    stages, out = ReadingNoise(slices, channels, context, fusable=False, gained=False), np.empty_like(frames)
     for step, frame in enumerate(frames):
         context.age.fill_(step)
-        stages.launch(wp.array(np.ascontiguousarray(frame.transpose(2, 0, 1)), device=where), measured, dt)
-        out[step] = stages.read(measured).numpy().transpose(1, 2, 0)
+        stages.io.measured.assign(np.ascontiguousarray(frame.transpose(2, 0, 1)))
+        stages.launch(dt)
+        out[step] = stages.read().numpy().transpose(1, 2, 0)
     return out

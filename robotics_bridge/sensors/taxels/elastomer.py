@@ -122,16 +122,13 @@ class ElastomerRuntime(ProbeRuntime):
             probes, layer = sensor.probes, sensor.layer or Layer()
             rows, columns = _sides(place)
             widening = layer.expansion if isinstance(layer.expansion, tuple) else (layer.expansion,) * 2
-            frame, pitch = layer.frame or (0.0, 0.0), probes.pitch or (0.0, 0.0)
-            along, across, normal = (wp.vec3f(*axis.tolist()) for axis in _axes(sensor))
+            pitch = probes.pitch or (0.0, 0.0)
+            along, across, normal = _axes(sensor)
             gel = fill(
-                GelParams, sensor, **vars(layer), dilate=sensor.dilate_scale, shear=sensor.shear_scale,
-                spread=sensor.dilate_spread, smear=sensor.shear_spread, layered=int(sensor.layer is not None),
-                expansion_x=widening[0], expansion_y=widening[1], frame_x=frame[0], frame_y=frame[1],
-                start=place.start, rows=rows, columns=columns, step_y=pitch[0], step_x=pitch[1],
-                link=self.context.scene.link_index(sensor.link), slot=self.slots[index], own_first=owned,
-                own_last=owned + len(pad_geometries[index]), along=along, across=across, normal=normal,
-                center=wp.vec3f(*probes.position[probes.active].mean(axis=0).tolist()),
+                GelParams, sensor, layer, layered=sensor.layer is not None, expansion=widening,
+                frame=layer.frame or (0.0, 0.0), start=place.start, rows=rows, columns=columns, step_y=pitch[0],
+                step_x=pitch[1], slot=self.slots[index], own_first=owned, own_last=owned + len(pad_geometries[index]),
+                along=along, across=across, normal=normal, center=probes.position[probes.active].mean(axis=0),
             )  # fmt: skip
             owned += len(pad_geometries[index])
             gels.append(gel)

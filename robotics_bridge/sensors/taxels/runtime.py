@@ -21,7 +21,7 @@ from robotics_bridge.sensors.kernels.contact_load import (
 )
 from robotics_bridge.sensors.kernels.kinematic import KinematicParams, StickArrays, kinematic_kernel, measure_kernel
 from robotics_bridge.sensors.kernels.proximity import ProximityArrays, ProximityParams, proximity_kernel
-from robotics_bridge.sensors.kernels.readout import FUSED, PressArrays
+from robotics_bridge.sensors.kernels.readout import CLEAN, FUSED, PressArrays
 from robotics_bridge.sensors.probes.placement import Probes
 from robotics_bridge.sensors.queries.solids import list_by_cells, sample_cloud
 from robotics_bridge.sensors.runtime import ProbeRuntime, SuiteContext, probe_rows
@@ -44,10 +44,7 @@ class KinematicRuntime(ProbeRuntime):
             self.kinds, first.query == "raycast", first.convention == "physical", first.sticky, self.summed, self.mode,
             *self.stores, context.device.is_cuda, self.mode == FUSED and len(rows) == self.count,
         )  # fmt: skip
-        laws = [
-            fill(KinematicParams, sensor, friction=sensor.friction or 0.0, twist=sensor.torsion)
-            for sensor in sensors.values()
-        ]
+        laws = [fill(KinematicParams, sensor, friction=sensor.friction or 0.0) for sensor in sensors.values()]
         self._laws = context.array(laws, KinematicParams)
         self.rows: Any = context.array(rows, wp.vec4i)
         """Warp array [R]: rows of taxels that one thread takes in turn."""
@@ -131,7 +128,7 @@ class ContactLoadRuntime(KinematicRuntime):
         shape, press = (envs, self.count), self.press
         press.touch, press.body = context.zeros(shape, wp.vec4f), context.zeros(shape, int)
         press.listed, press.end = context.zeros(shape, int), context.zeros((envs, len(configs)), int)
-        press.noisy = context.zeros(shape if self.noisy else (1, 1))
+        press.noisy = context.zeros(shape if self.mode != CLEAN else (1, 1))
         press.sigma = context.zeros(shape if sticky else (1, 1), wp.vec3f)
         faces = self.faces
         faces.head, faces.listed = (context.array(np.full((envs, len(places)), -1), int) for _ in range(2))

@@ -24,6 +24,7 @@ from robotics_bridge.sensors.kernels.heat import (
     exchange_heat,
     sense_temperature,
 )
+from robotics_bridge.sensors.kernels.readout import CLEAN
 from robotics_bridge.sensors.runtime import Runtime, SuiteContext
 from robotics_bridge.sensors.suite import SensorSuite
 from robotics_bridge.sensors.temperature.grid import TemperatureGrid
@@ -62,7 +63,7 @@ class TemperatureRuntime(Runtime):
         temperatures = np.tile([body.temperature for body in links], (context.num_envs, 1))
         shape, many = (context.num_envs, self.count), (context.num_envs, len(structures))
         heat = HeatArrays()
-        heat.sensors, heat.part = context.array(structures, ThermalParams), self.part
+        heat.sensors = context.array(structures, ThermalParams)
         heat.exposed = context.array(np.concatenate(exposed), float)
         heat.source = context.array(np.concatenate(source), float)
         heat.link_of = context.solids.struct.link
@@ -83,9 +84,8 @@ class TemperatureRuntime(Runtime):
         self._axes = [axis for axis in range(3) if any(sensor.cells[axis] > 1 for sensor in self._sensors)]
         # What the element shows differs from the cell where it lags, or where its range ends.
         limits = [value for sensor in self._sensors for value in (sensor.warm_range, sensor.cold_range)]
-        if not self.noisy and (min(limits) < math.inf or any(sensor.tau > 0 for sensor in self._sensors)):
+        if self.mode == CLEAN and (min(limits) < math.inf or any(sensor.tau > 0 for sensor in self._sensors)):
             self.io.measured = wp.zeros_like(self.io.truth)
-            self.readable.append(self.io.measured)
         self._warned = False
         self._dt = math.nan
         self._set_step(1e-2)
@@ -95,16 +95,12 @@ class TemperatureRuntime(Runtime):
         edges = (high - low) / np.array(sensor.cells)
         self._edges.append(edges)
         solid = material(sensor.material)
-        contact = sensor.contact_conductance if math.isfinite(sensor.contact_conductance) else 0.0
-        cold, warm = (min(value, 1e9) for value in (sensor.cold_range, sensor.warm_range))
         # C = ρ c_p V of a whole cell; the source is given per volume for the same reason, not per area as in 4.36.
         capacity = solid.density * solid.specific_heat * edges.prod()
         return fill(
-            ThermalParams, sensor, link=self.context.scene.link_index(sensor.link), first=first,
-            shape=wp.vec3i(*sensor.cells), low=wp.vec3f(*low), cell=wp.vec3f(*edges), conductivity=solid.conductivity,
-            diffusivity=solid.diffusivity, capacity=capacity, emissivity=solid.emissivity if sensor.radiates else 0.0,
-            ambient=sensor.ambient_temperature, base=sensor.base_temperature, contact=contact,
-            bluntness=sensor.contact_radius, published=int(sensor.conduction == "thesis"), cold=cold, warm=warm,
+            ThermalParams, sensor, solid, link=self.context.scene.link_index(sensor.link), first=first, corner=low,
+            cell=edges, capacity=capacity, published=sensor.conduction == "thesis",
+            emissivity=solid.emissivity if sensor.radiates else 0.0,
         )  # fmt: skip
 
     def _set_step(self, dt: float) -> None:
@@ -153,7 +149,7 @@ class TemperatureRuntime(Runtime):
             now, spare = self._buffers
             c.launch(exchange_heat, cells, heat, self.io, now)
             for axis in self._axes:
-                c.launch(diffuse_heat, cells, axis, heat, now, spare)
+                c.launch(diffuse_heat, cells, axis, heat, self.io, now, spare)
                 now, spare = spare, now
             c.launch(sense_temperature, cells, heat, self.io, now)
 

@@ -192,67 +192,71 @@ def test_jitter_varies_the_delay_within_its_bounds_and_alike_for_all_probes():
 
 
 def _stage(noise: Noise, envs: int = 3, probes: int = 4, active: np.ndarray | None = None, gained: bool = True):
-    from brainbench.core.devices import pick_device, warp
+    from brainbench.core.devices import pick_device
 
-    wp = warp()
     context = LaunchContext(envs, pick_device("cpu"), 0, 0)
     context.age.fill_(0)
     slices = [ReadoutSlice("sensor", noise, 0, (probes,), active=active)]
-    x, out = (wp.zeros((1, envs, probes), dtype=wp.float32, device="cpu") for _ in range(2))
-    return context, ReadingNoise(slices, 1, context, staged=True, gained=gained), x, out
+    return context, ReadingNoise(slices, 1, context, fusable=False, gained=gained)
 
 
 def test_a_reset_redraws_and_forgets_in_its_environment_alone():
     noise = Noise(walk=1.0, gain=(0.5, 2.0), hysteresis=1.0)
-    clock, stage, x, out = _stage(noise, gained=False)
-    x.fill_(1.0)
+    clock, stage = _stage(noise, gained=False)
+    out = stage.io.measured
+
+    def read(x: float = 1.0) -> np.ndarray:
+        out.fill_(x)
+        stage.launch(0.01)
+        return out.numpy()[0].copy()
+
     for step in range(10):
         clock.age.fill_(step)
-        stage.launch(x, out, 0.01)
-    before = out.numpy()[0].copy()
+        before = read()
     clock.age.assign(np.array([10, 0, 10], np.int32))
     clock.episode.assign(np.array([0, 1, 0], np.int32))
-    stage.launch(x, out, 0.01)
-    change = np.abs(out.numpy()[0] - before)
-    gain = (out.numpy()[0, 1]) / 2  # x_0 (1 + β) plus one step of the walk
+    begun = read()
+    change = np.abs(begun - before)
+    gain = begun[1] / 2  # x_0 (1 + β) plus one step of the walk
     assert np.all(change[[0, 2]] < 5)
     assert np.all((gain > 0.5 - 2) & (gain < 2 + 2))
     clock.age.assign(np.array([11, 0, 11], np.int32))
     clock.episode.assign(np.array([0, 1, 0], np.int32))
     again = out.numpy()[0, 1].copy()
-    stage.launch(x, out, 0.01)
-    assert np.array_equal(out.numpy()[0, 1], again)
+    assert np.array_equal(read()[1], again)
 
 
 def test_fillers_read_zero_and_a_broken_environment_harms_no_other():
     noise = Noise(bias=1.0, walk=0.1, hysteresis=0.5)
-    clock, stage, x, out = _stage(noise, active=np.array([True, True, False, True]))
+    clock, stage = _stage(noise, active=np.array([True, True, False, True]))
     for step in range(3):
         clock.age.fill_(step)
         values = np.ones((1, 3, 4), np.float32)
         if step == 1:
             values[0, 1] = np.nan
-        x.assign(values)
-        stage.launch(x, out, 0.01)
-        read = stage.read(out).numpy()[0]
+        stage.io.measured.assign(values)
+        stage.launch(0.01)
+        read = stage.read().numpy()[0]
         assert np.all(read[:, 2] == 0)
         assert np.isnan(read[1, [0, 1, 3]]).all() == (step == 1)
         assert np.isfinite(read[[0, 2]]).all()
 
 
 def test_the_state_counts_two_numbers_per_channel():
-    _clock, stage, x, out = _stage(Noise(walk=1.0, hysteresis=0.5, read_delay=0.01), probes=10)
-    assert sum(array.size for array in stage.lasting) == 3 * 10 * 2
-    assert not any(array.size for array in _stage(Noise(white=1.0, gain=(0.5, 2), dead_probability=0.5))[1].lasting)
-    stage.launch(x, out, 0.01)
+    _clock, stage = _stage(Noise(walk=1.0, hysteresis=0.5, read_delay=0.01), probes=10)
+    read = 2 * 3 * 10  # the truth and what is measured
+    assert sum(array.size for array in stage.memory) == read + 3 * 10 * 2
+    plain = _stage(Noise(white=1.0, gain=(0.5, 2), dead_probability=0.5), probes=10)[1]
+    assert sum(array.size for array in plain.memory) == read
+    stage.launch(0.01)
     assert sum(array.size for array in stage.rings) == 3 * 3 * 10
 
 
 def test_a_shorter_step_than_the_ring_has_room_for_is_refused():
-    _clock, stage, x, out = _stage(Noise(read_delay=0.1))
-    stage.launch(x, out, 0.05)
+    _clock, stage = _stage(Noise(read_delay=0.1))
+    stage.launch(0.05)
     with pytest.raises(UsageError, match=r"21 readings.*room for 3"):
-        stage.launch(x, out, 0.005)
+        stage.launch(0.005)
 
 
 def test_a_signal_with_other_axes_is_refused():

@@ -209,7 +209,7 @@ def test_the_published_conduction_is_available_with_its_length_and_area():
     assert float(suite.read_ground_truth("grid")) - 20 == pytest.approx(expected, rel=2e-2)
 
 
-def test_a_contact_of_depth_has_the_area_of_a_cut_ball_and_none_gives_no_heat():
+def test_a_contact_has_the_area_of_a_cut_ball_and_none_without_depth_or_conductance_gives_heat():
     def gain(depth: float, conductance: float = 1.0) -> float:
         suite, state = make_grid(
             contacts=1, cells=(1, 1, 1), base_temperature=0.0, contact_conductance=conductance, contact_radius=0.004,
@@ -219,7 +219,7 @@ def test_a_contact_of_depth_has_the_area_of_a_cut_ball_and_none_gives_no_heat():
         suite.update(state, 1.0)
         return float(suite.read_ground_truth("grid"))
 
-    assert gain(0.0) == 0
+    assert gain(0.0) == gain(1e-3, 0.0) == 0
     # A poor interface is all the resistance: heat is proportional to the area.
     assert gain(1e-3) / gain(5e-4) == pytest.approx((2 * 4 * 1 - 1) / (2 * 4 * 0.5 - 0.25), rel=1e-2)
     capacity = 1000 * 100 * 8 * 0.01 * 0.02 * 0.03
