@@ -11,10 +11,12 @@ as white noise of variance q²/12, which is right while the white noise is not m
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -81,7 +83,7 @@ class Log:
             raise UsageError(f"Readings are [T, N] with T = {len(self.time)}; received {self.readings.shape}.")
         if self.probes and len(self.probes) != self.readings.shape[1]:
             raise UsageError(f"{self.readings.shape[1]} probes have as many names; received {len(self.probes)}.")
-        gaps = np.diff(self.time)[np.diff(self.episode) == 0] if self.episode is not None else np.diff(self.time)
+        gaps = np.concatenate([np.diff(self.time[span]) for span in self.spans])
         if len(gaps) and not (gaps.min() > 0 and gaps.max() <= 1.5 * gaps.min()):
             raise UsageError(
                 "Times of a log must rise in equal steps within an episode; received steps of "
@@ -96,6 +98,13 @@ class Log:
             raise UsageError(f"ball is [T, 3] (m); received {self.ball.shape}.")
         if self.ball is not None and (far := float(np.abs(self.ball).max())) > FARTHEST:
             raise UsageError(f"The ball lies {far:g} m from the origin of its link; scale millimetres by 1e-3.")
+
+    @cached_property
+    def spans(self) -> list[slice]:
+        """Rows of each episode."""
+        numbers = self.episode if self.episode is not None else np.zeros(len(self.time), int)
+        edges = [0, *(np.flatnonzero(np.diff(numbers)) + 1), len(numbers)]
+        return [slice(start, end) for start, end in itertools.pairwise(edges)]
 
     @property
     def step(self) -> float:
@@ -139,10 +148,7 @@ def read_log(path: str | os.PathLike[str]) -> Log:
 def segments(log: Log) -> list[Episode]:
     """Split a log into its episodes, without those of fewer than :data:`SHORTEST` readings."""
     x = np.zeros(len(log.time)) if log.reference is None else log.reference
-    numbers = np.zeros(len(x), int) if log.episode is None else log.episode
-    edges = np.flatnonzero(np.diff(numbers)) + 1
-    parts = zip(np.split(x, edges), np.split(log.readings, edges), strict=True)
-    long = [(a, b) for a, b in parts if len(a) >= SHORTEST]
+    long = [(x[span], log.readings[span]) for span in log.spans if span.stop - span.start >= SHORTEST]
     if not long:
         raise DataError(f"Every episode of the log has fewer than {SHORTEST} readings; record longer ones.")
     return long

@@ -229,7 +229,7 @@ class _Search:
         size, seen = (np.linalg.norm(values, axis=2) for values in (expected, self.readings - bias))
         total, heard = size[:, touched].sum(axis=1), seen[:, touched].sum(axis=1)
         step = presses.log.step
-        lags = find_delays([(total[span], heard[span, None]) for span in presses.spans], round(max_delay / step))
+        lags = find_delays([(total[span], heard[span, None]) for span in presses.log.spans], round(max_delay / step))
         shared["read_delay"] = sum(lags) / 2 * step
         late = Lag(presses, shared).delayed(size)
         scale = np.median((late * seen).sum(axis=0)[touched] / np.maximum((late**2).sum(axis=0)[touched], 1e-300))
@@ -252,7 +252,7 @@ class _Search:
         ratio = 1 + 0.5 * (self.walk / self.white) ** 2
         theta = ratio - np.sqrt(ratio**2 - 1)
         values = np.moveaxis(values, axis, 0)
-        parts = [lfilter([1.0, -1.0], [1.0, -theta], values[span], axis=0) for span in self.presses.spans]
+        parts = [lfilter([1.0, -1.0], [1.0, -theta], values[span], axis=0) for span in self.presses.log.spans]
         return np.moveaxis(np.concatenate(parts), 0, axis) * np.sqrt(theta) / self.white
 
     def rest(self, readings: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -361,7 +361,9 @@ class _Search:
         for _ in range(2):
             rest = (self.readings - self.reply.readings)[:, self.touched].reshape(len(self.readings), -1)[:, :_CHANNELS]
             rest = np.clip(rest, -4 * self.white, 4 * self.white)
-            parts = [(np.zeros(len(rest[span])), rest[span], np.arange(len(rest[span]))) for span in self.presses.spans]
+            parts = [
+                (np.zeros(len(rest[span])), rest[span], np.arange(len(rest[span]))) for span in self.presses.log.spans
+            ]
             fit = fit_dynamics(parts, self.presses.log.step, self.quantum, moving=False)
             # What the fitted numbers explain of the noise is missing in the residuals.
             taxels, channels = self.readings[0, self.touched].shape

@@ -8,7 +8,6 @@ C axis (1: along the inward normal, or 3), G shared number, Q touch of one taxel
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -91,21 +90,14 @@ class Presses:
         return np.tile(np.eye(3), (count, 1, 1)) if self.readings.shape[2] == 3 else -self.probes.normal[:, None]
 
     @cached_property
-    def spans(self) -> list[slice]:
-        """Rows of each episode."""
-        numbers = self.log.episode if self.log.episode is not None else np.zeros(len(self.log.time), int)
-        edges = [0, *(np.flatnonzero(np.diff(numbers)) + 1), len(numbers)]
-        return [slice(start, end) for start, end in itertools.pairwise(edges)]
-
-    @cached_property
     def speed(self) -> NDArray[np.float64]:
         """[T, 3] of the ball (m/s)."""
-        return np.concatenate([np.gradient(self.ball[span], self.log.step, axis=0) for span in self.spans])
+        return np.concatenate([np.gradient(self.ball[span], self.log.step, axis=0) for span in self.log.spans])
 
     def stretches(self, near: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
         """Return the rows of each stretch of ``near`` [T], which ends with an episode."""
         blocks: list[NDArray[np.int64]] = []
-        for span in self.spans:
+        for span in self.log.spans:
             rows = np.arange(span.start, span.stop)[near[span]]
             blocks += [block for block in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(block)]
         return blocks
@@ -259,7 +251,7 @@ class Lag:
     """Delay and hysteresis of a device, applied to signals along an axis T, episode by episode."""
 
     def __init__(self, presses: Presses, shared: dict[str, float]) -> None:
-        self._spans, self._step = presses.spans, presses.log.step
+        self._spans, self._step = presses.log.spans, presses.log.step
         self._delay, self._share = shared["read_delay"] / self._step, shared["hysteresis"]
         self._tau = np.exp(shared["hysteresis_tau"])
 
