@@ -10,7 +10,6 @@ import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -318,12 +317,11 @@ class MujocoWarpEngine:
                 self._engine.set_const(self._m, self.data)
             self._root = wp.array(np.asarray(self.model.body_rootid, dtype=np.int32), dtype=wp.int32)
         contact = self.data.contact
-        blank = HandState.empty(num_envs, self.model.nbody, contact.worldid.shape[0], self._device)
+        self.state: HandState = HandState.empty(num_envs, self.model.nbody, contact.worldid.shape[0], self._device)
         # The engine's own arrays serve where they have the form of the state's.
-        self.state: HandState = replace(
-            blank, contact_geom=contact.geom, contact_env=contact.worldid, contact_distance=contact.dist,
-            contact_position=contact.pos, contact_count=self.data.nacon, time=self.data.time,
-        )  # fmt: skip
+        arrays = self.state.arrays
+        arrays.contact_geom, arrays.contact_env, arrays.contact_distance = contact.geom, contact.worldid, contact.dist
+        arrays.contact_position, arrays.contact_count, arrays.time = contact.pos, self.data.nacon, self.data.time
         self._replay: Callable[[], None] | None = None
         self.forward()
 
@@ -411,19 +409,16 @@ class MujocoWarpEngine:
         self._fill()
 
     def _fill_links(self) -> None:
-        wp, d, state = warp(), self.data, self.state
+        d = self.data
         # MuJoCo's quaternions are (w, x, y, z); the kernel stores them as Warp's (x, y, z, w).
-        poses = [d.xpos, d.xquat, d.cvel, d.subtree_com, self._root, state.pose, state.velocity]
-        wp.launch(fill_links, dim=(self.num_envs, self.model.nbody), inputs=poses, device=self._device)
+        inputs = [d.xpos, d.xquat, d.cvel, d.subtree_com, self._root, self.state.arrays]
+        warp().launch(fill_links, dim=(self.num_envs, self.model.nbody), inputs=inputs, device=self._device)
 
     def _fill(self) -> None:
-        wp, d, state = warp(), self.data, self.state
         self._fill_links()
-        pyramidal = int(self.model.opt.cone == 0)
-        c = d.contact
-        inputs = [d.nacon, c.worldid, c.frame, c.dim, c.efc_address, d.efc.force, c.friction, pyramidal]
-        inputs += [state.contact_normal, state.contact_force, state.contact_friction, state.contact_couple]
-        wp.launch(fill_contacts, dim=c.worldid.shape[0], inputs=inputs, device=self._device)
+        c, pyramidal = self.data.contact, int(self.model.opt.cone == 0)
+        inputs = [c.frame, c.dim, c.efc_address, self.data.efc.force, c.friction, pyramidal, self.state.arrays]
+        warp().launch(fill_contacts, dim=c.worldid.shape[0], inputs=inputs, device=self._device)
 
 
 def _put_model(engine: Any, model: Any, varied: Mapping[str, np.ndarray], num_envs: int) -> Any:

@@ -6,9 +6,8 @@ whose quaternions are (x, y, z, w): views of them copy nothing.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -24,36 +23,21 @@ _CONTACT = {"distance": 0.0, "force": float("nan"), "position": 0.0, "normal": 0
 MOST_ENVS = 1_000_000  # most environments at once; more is a slip of the keys that would fill the memory
 
 
-@dataclass(eq=False)
 class HandState:
-    """Buffers with fixed addresses, on one device; engines write them, sensors only read them."""
+    """Buffers with fixed addresses, on one device; engines write them, sensors only read them.
 
-    pose: Any
-    """Warp array [B, L] of transforms: world pose of every link frame (x, y, z, qx, qy, qz, qw)."""
-    velocity: Any
-    """Warp array [B, L] of spatial vectors: velocity of the link's origin (m/s) and angular velocity (rad/s)."""
-    contact_geom: Any
-    """Warp array [C] of vec2i: geometry numbers of every contact, of all environments mixed."""
-    contact_env: Any
-    """Warp array [C] int32: environment of every contact."""
-    contact_distance: Any
-    """Warp array [C] float32: gap of every contact, negative for overlap (m)."""
-    contact_position: Any
-    """Warp array [C] of vec3 (m)."""
-    contact_normal: Any
-    """Warp array [C] of vec3, from the first geometry to the second."""
-    contact_force: Any
-    """Warp array [C] float32: normal force (N); NaN where the engine does not tell."""
-    contact_friction: Any
-    """Warp array [C] of vec3: tangential force on the second geometry (N), world axes; 0 where the engine does not
-    tell."""
-    contact_couple: Any
-    """Warp array [C] of vec3: torque on the second geometry about the point (N·m), world axes, of what resists turning
-    and rolling; 0 where the engine does not tell."""
-    contact_count: Any
-    """Warp array [1] int32: contacts found, which may exceed the room C."""
-    time: Any
-    """Warp array [B] float32 (s)."""
+    Every array of :class:`~robotics_bridge.physics.kernels.state.StateArrays` is an attribute: ``state.pose``,
+    ``state.contact_force``, …
+    """
+
+    def __init__(self, arrays: Any) -> None:
+        self.arrays = arrays
+        """The Warp structure of the buffers that kernels take."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name in StateArrays.vars:
+            return getattr(self.arrays, name)
+        raise AttributeError(f"A HandState has no {name!r}.")
 
     @classmethod
     def empty(cls, num_envs: int, num_links: int, contacts: int = 0, device: Any = "cpu") -> HandState:
@@ -61,30 +45,16 @@ class HandState:
         check_number("environments of a state", num_envs, least=1, most=MOST_ENVS, whole=True)
         check_number("links of a state", num_links, least=1, whole=True)
         check_number("contacts of a state", contacts, least=0, whole=True)
-        wp, device = warp(), pick_device(device)
-        pose = np.zeros((num_envs, num_links, 7), dtype=np.float32)
-        # Unit quaternion in Warp's order (x, y, z, w).
-        pose[..., 6] = 1
-        room = max(contacts, 1)
-        sizes = {
-            "velocity": ((num_envs, num_links), wp.spatial_vectorf), "time": (num_envs, wp.float32),
-            "contact_count": (1, wp.int32), "contact_env": (room, wp.int32),
-            "contact_geom": (room, wp.vec2i), "contact_distance": (room, wp.float32),
-            **{f"contact_{name}": (room, wp.vec3f) for name in ("position", "normal", "friction", "couple")},
-        }  # fmt: skip
-        return cls(
-            pose=wp.array(pose, dtype=wp.transformf, device=device),
-            contact_force=wp.full(room, float("nan"), dtype=wp.float32, device=device),
-            **{name: wp.zeros(size, dtype=kind, device=device) for name, (size, kind) in sizes.items()},
-        )
-
-    @cached_property
-    def arrays(self) -> Any:
-        """The Warp structure of the buffers that kernels take."""
-        struct = StateArrays()
-        for name in StateArrays.vars:
-            setattr(struct, name, getattr(self, name))
-        return struct
+        wp, device, arrays = warp(), pick_device(device), StateArrays()
+        links = (num_envs, num_links)
+        sizes = {"pose": links, "velocity": links, "time": num_envs, "contact_count": 1}
+        for name, field in StateArrays.vars.items():
+            shape = sizes.get(name, max(contacts, 1))
+            setattr(arrays, name, wp.zeros(shape, dtype=field.type.dtype, device=device))
+        # Unit quaternions in Warp's order (x, y, z, w).
+        arrays.pose.fill_(wp.transformf(*[0.0] * 6, 1.0))
+        arrays.contact_force.fill_(math.nan)
+        return cls(arrays)
 
     @property
     def device(self) -> Any:

@@ -14,28 +14,33 @@ UNIT_TOLERANCE = wp.constant(1e-3)
 
 @wp.struct
 class StateArrays:
-    """Arrays of a ``HandState``, as kernels take them."""
+    """Arrays of a ``HandState``."""
 
     pose: wp.array2d(dtype=wp.transformf)
-    """[B, L]."""
+    """[B, L] world pose of every link frame (x, y, z, qx, qy, qz, qw)."""
     velocity: wp.array2d(dtype=wp.spatial_vectorf)
-    """[B, L] of the origin, then angular."""
+    """[B, L] velocity of the link's origin (m/s), then angular velocity (rad/s)."""
     contact_count: wp.array(dtype=wp.int32)
-    """[1] contacts found, which may exceed C."""
+    """[1] contacts found, which may exceed the room C."""
     contact_env: wp.array(dtype=wp.int32)
-    """[C]."""
+    """[C] environment of every contact."""
     contact_geom: wp.array(dtype=wp.vec2i)
-    """[C]."""
+    """[C] its geometry numbers, of all environments mixed."""
     contact_distance: wp.array(dtype=wp.float32)
-    """[C] gap, negative for overlap."""
+    """[C] gap, negative for overlap (m)."""
     contact_position: wp.array(dtype=wp.vec3f)
-    """[C]."""
+    """[C] (m)."""
     contact_normal: wp.array(dtype=wp.vec3f)
     """[C] from the first geometry to the second."""
     contact_force: wp.array(dtype=wp.float32)
-    """[C] normal force; NaN where the engine does not tell."""
+    """[C] normal force (N); NaN where the engine does not tell."""
+    contact_friction: wp.array(dtype=wp.vec3f)
+    """[C] tangential force on the second geometry (N), world axes; 0 where the engine does not tell."""
     contact_couple: wp.array(dtype=wp.vec3f)
-    """[C] torque on the second geometry about the point (N·m)."""
+    """[C] torque on the second geometry about the point (N·m), world axes, of what resists turning and rolling; 0 where
+    the engine does not tell."""
+    time: wp.array(dtype=wp.float32)
+    """[B] (s)."""
 
 
 @wp.func
@@ -66,8 +71,7 @@ def fill_links(
     cvel: wp.array2d(dtype=wp.spatial_vectorf),
     subtree_com: wp.array2d(dtype=wp.vec3f),
     root: wp.array(dtype=wp.int32),
-    pose: wp.array2d(dtype=wp.transformf),
-    velocity: wp.array2d(dtype=wp.spatial_vectorf),
+    state: StateArrays,
 ):
     """Turn MuJoCo's poses and spatial velocities into those of link origins. Thread: environment and link [B, L].
 
@@ -77,28 +81,23 @@ def fill_links(
     p = xpos[env, link]
     # MuJoCo stores (w, x, y, z) in Warp's quaternions.
     q = xquat[env, link]
-    pose[env, link] = wp.transformf(p, wp.quatf(q[1], q[2], q[3], q[0]))
+    state.pose[env, link] = wp.transformf(p, wp.quatf(q[1], q[2], q[3], q[0]))
     twist = cvel[env, link]
     # Velocity of a rigid body shifted from the reference point of the tree to the link's origin: v + ω × r.
     omega = wp.vec3f(twist[0], twist[1], twist[2])
     linear = wp.vec3f(twist[3], twist[4], twist[5]) + wp.cross(omega, p - subtree_com[env, root[link]])
-    velocity[env, link] = wp.spatial_vectorf(linear[0], linear[1], linear[2], omega[0], omega[1], omega[2])
+    state.velocity[env, link] = wp.spatial_vectorf(linear[0], linear[1], linear[2], omega[0], omega[1], omega[2])
 
 
 @wp.kernel
 def fill_contacts(
-    count: wp.array(dtype=wp.int32),
-    env: wp.array(dtype=wp.int32),
     frame: wp.array(dtype=wp.mat33f),
     dim: wp.array(dtype=wp.int32),
     address: wp.array2d(dtype=wp.int32),
     efc_force: wp.array2d(dtype=wp.float32),
     cone: wp.array(dtype=Any),
     pyramidal: int,
-    normal: wp.array(dtype=wp.vec3f),
-    force: wp.array(dtype=wp.float32),
-    friction: wp.array(dtype=wp.vec3f),
-    couple: wp.array(dtype=wp.vec3f),
+    state: StateArrays,
 ):
     """Read normal, normal force, friction (N) and torque (N·m) of every contact. Thread: contact [C].
 
@@ -106,10 +105,11 @@ def fill_contacts(
     about an axis, the difference of its two edges by the coefficient ``cone``.
     """
     c = wp.tid()
-    if c >= count[0]:
+    if c >= state.contact_count[0]:
         return
+    env = state.contact_env[c]
     rows = frame[c]
-    normal[c] = wp.vec3f(rows[0, 0], rows[0, 1], rows[0, 2])
+    state.contact_normal[c] = wp.vec3f(rows[0, 0], rows[0, 1], rows[0, 2])
     total = float(0.0)
     # An elliptic cone has one row for the normal force; a pyramidal one has two edges per tangent, each of which
     # carries a share of it.
@@ -119,8 +119,8 @@ def fill_contacts(
     for edge in range(edges):
         row = address[c, edge]
         if row >= 0:
-            total += efc_force[env[c], row]
-    force[c] = total
+            total += efc_force[env, row]
+    state.contact_force[c] = total
     slip = wp.vec3f(0.0)
     spin = wp.vec3f(0.0)
     # Along two tangents, then about the normal and about both tangents.
@@ -132,13 +132,13 @@ def fill_contacts(
             first = address[c, 2 * axis]
             second = address[c, 2 * axis + 1]
             if first >= 0 and second >= 0:
-                share = cone[c][axis] * (efc_force[env[c], first] - efc_force[env[c], second])
+                share = cone[c][axis] * (efc_force[env, first] - efc_force[env, second])
         elif first >= 0:
-            share = efc_force[env[c], first]
+            share = efc_force[env, first]
         along = share * wp.vec3f(rows[side, 0], rows[side, 1], rows[side, 2])
         if axis < 2:
             slip += along
         else:
             spin += along
-    friction[c] = slip
-    couple[c] = spin
+    state.contact_friction[c] = slip
+    state.contact_couple[c] = spin

@@ -25,7 +25,7 @@ from typing import Any
 
 from brainbench.core.devices import warp
 from robotics_bridge.physics.kernels.state import StateArrays
-from robotics_bridge.sensors.kernels.distance import FAR, SIDED, SolidArrays, shape_functions
+from robotics_bridge.sensors.kernels.distance import FAR, SIDED, SolidArrays, distance_function
 from robotics_bridge.sensors.kernels.pairs import PairArrays, SlotArrays, push_side
 from robotics_bridge.sensors.kernels.readout import (
     CLEAN,
@@ -163,9 +163,7 @@ class Carrier:
 
 
 @wp.func
-def push_of(
-    plan: SpreadPlan, state: StateArrays, friction: wp.array(dtype=wp.vec3f), env: int, link: int, node: int
-) -> ContactPush:
+def push_of(plan: SpreadPlan, state: StateArrays, env: int, link: int, node: int) -> ContactPush:
     """Return what a node's contact does to its link."""
     c = node // 2
     # The normal leads from the first to the second, which it pushes away.
@@ -176,7 +174,7 @@ def push_of(
     push.point = wp.quat_rotate_inv(turn, state.contact_position[c] - wp.transform_get_translation(here))
     push.normal = wp.quat_rotate_inv(turn, sign * state.contact_normal[c])
     push.load = state.contact_force[c]
-    push.force = push.load * push.normal + plan.slip * wp.quat_rotate_inv(turn, sign * friction[c])
+    push.force = push.load * push.normal + plan.slip * wp.quat_rotate_inv(turn, sign * state.contact_friction[c])
     push.couple = plan.slip * wp.quat_rotate_inv(turn, sign * state.contact_couple[c])
     push.overlap = wp.max(-state.contact_distance[c], 0.0)
     return push
@@ -221,9 +219,8 @@ def list_contacts(
 
 @wp.kernel(enable_backward=False)
 def join_faces(
-    plan: SpreadPlan, link_of: wp.array(dtype=wp.int32), state: StateArrays, friction: wp.array(dtype=wp.vec3f),
-    faces: ContactFaces, io: ReadoutArrays,
-):  # fmt: skip
+    plan: SpreadPlan, link_of: wp.array(dtype=wp.int32), state: StateArrays, faces: ContactFaces, io: ReadoutArrays
+):
     """Join the nodes to faces in their order, whatever that of threads was, and list links with any. Thread: [B, M]."""
     env, number = wp.tid()
     link = plan.links[number]
@@ -255,7 +252,7 @@ def join_faces(
         more = least[wp.static(SORTED - 1)] != wp.static(BEYOND)
         while least[0] != wp.static(BEYOND):
             latest = least[0]
-            push = push_of(plan, state, friction, env, link, latest)
+            push = push_of(plan, state, env, link, latest)
             geometry = state.contact_geom[latest // 2][1 - latest % 2]
             other = int(-1)
             if geometry >= 0:
@@ -358,7 +355,7 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, mode: int, sticky: bool,
         deep: all sources of carriers; a GPU first takes the links where :data:`TOUCH` is enough, which needs fewer
             registers.
     """
-    distance = shape_functions(kinds, raycast).distance
+    distance_to = distance_function(kinds, raycast)
     cuda, noisy, staged, group = lanes > 1, mode != CLEAN, mode == STAGED, group_functions(lanes)
     total_of, largest_of, rank_of, group_meets = group.total, group.largest, group.rank, group.meet
 
@@ -367,7 +364,7 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, mode: int, sticky: bool,
         solids: SolidArrays, pairs: PairArrays, probes: ProbeArrays, env: int, n: int, slot: int, body: int
     ) -> wp.vec4f:
         """Return outward normal and distance of what a taxel overlaps of a body most."""
-        row = env % solids.kind.shape[0]
+        row = env % solids.solid.shape[0]
         radius = probes.radius[n]
         nearest = wp.vec4f(0.0, 0.0, 1.0, wp.static(FAR))
         first = pairs.first[slot]
@@ -382,9 +379,9 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, mode: int, sticky: bool,
                     facing = rotation @ (radius * probes.normal[n])
                     side = push_side(pairs, env, place, probes.normal[n])
                 if wp.static(raycast or bool(kinds & SIDED)):
-                    limit = 2.0 * solids.bound[row, geometry][3] + radius
+                    limit = 2.0 * solids.solid[row, geometry].bound[3] + radius
                 x = rotation @ probes.position[n] + pairs.offset[env, place]
-                touch = distance(solids, row, geometry, x, facing, side, limit)
+                touch = distance_to(solids.values, solids.solid[row, geometry], x, facing, side, limit)
                 if touch[3] < nearest[3]:
                     m = wp.transpose(rotation) @ wp.vec3f(touch[0], touch[1], touch[2])
                     nearest = wp.vec4f(m[0], m[1], m[2], touch[3])
@@ -450,8 +447,8 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, mode: int, sticky: bool,
     )
     def spread(
         plan: SpreadPlan, probes: ProbeArrays, link_of: wp.array(dtype=wp.int32), state: StateArrays,
-        friction: wp.array(dtype=wp.vec3f), solids: SolidArrays, pairs: PairArrays, faces: ContactFaces,
-        press: PressArrays, stride: int, io: ReadoutArrays,
+        solids: SolidArrays, pairs: PairArrays, faces: ContactFaces, press: PressArrays, stride: int,
+        io: ReadoutArrays,
     ):  # fmt: skip
         item = int(wp.uint32(wp.tid()) // wp.uint32(wp.static(lanes)))
         lane = int(wp.uint32(wp.tid()) % wp.uint32(wp.static(lanes)))
@@ -518,7 +515,7 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, mode: int, sticky: bool,
                         push.normal = normal
                         if wp.static(deep):
                             if source == wp.static(NEAR):
-                                push = push_of(plan, state, friction, env, link, node)
+                                push = push_of(plan, state, env, link, node)
                         push.body = body
                         push.slot = span[2]
                         push.source = source

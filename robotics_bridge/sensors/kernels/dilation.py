@@ -11,7 +11,7 @@ from typing import Any
 
 from brainbench.core.devices import warp
 from robotics_bridge.sensors.context import numbers_of
-from robotics_bridge.sensors.kernels.distance import FAR, SolidArrays, SolidShape, shape_functions
+from robotics_bridge.sensors.kernels.distance import FAR, SolidArrays, SolidShape, distance_function
 from robotics_bridge.sensors.kernels.noise import episode_draw, radius_noise
 from robotics_bridge.sensors.kernels.pairs import PairArrays
 from robotics_bridge.sensors.kernels.probe import deepest_function
@@ -395,16 +395,14 @@ def marker_kernel(
                 signal = truth
             # Sum of 4.21. Shear has one value for both branches: radius noise acts on the dilation alone.
             truth += slide
-            age = io.age[env]
-            episode = io.episode[env]
             fixed = wp.vec3f(1.0, 0.0, 0.0)
             if wp.static(mode > 0):
-                fixed = episode_draw(io.knobs[part], env + io.env_offset, probe, episode)
+                fixed = episode_draw(io.knobs[part], env + io.env_offset, probe, io.episode[env])
             signal = fixed[0] * (signal + slide)
             all_truth = wp.spatial_vectorf(truth[0], truth[1], truth[2], 0.0, 0.0, 0.0)
             all_signal = wp.spatial_vectorf(signal[0], signal[1], signal[2], 0.0, 0.0, 0.0)
-            lag, drift = recall_six(io, env, n, age)
-            emit_six(io, io.knobs[part], env, n, probe, age, episode, fixed, lag, drift, all_truth, all_signal)
+            lag, drift = recall_six(io, env, n)
+            emit_six(io, env, n, fixed, lag, drift, all_truth, all_signal)
 
     return markers
 
@@ -424,8 +422,7 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool) -> A
         side_by_side: environments are neighbouring threads, dim [S · blocks, B]; otherwise dim [B, S · blocks], and
             what a pad of one geometry asks for each point is worked out once per block (costs registers).
     """
-    shapes = shape_functions(kinds, raycast)
-    shape_of, distance_to, distance = shapes.shape_of, shapes.distance_to, shapes.distance
+    distance_to = distance_function(kinds, raycast)
 
     @wp.func
     def pad_gap(solids: SolidArrays, own: wp.array(dtype=wp.int32), gel: GelParams, row: int, z: wp.vec3f) -> float:
@@ -435,9 +432,9 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool) -> A
             return wp.dot(z - gel.center, gel.normal)
         phi = float(wp.static(FAR))
         for o in range(gel.own_first, gel.own_last):
-            local = wp.transform_point(wp.transform_inverse(solids.frame[row, own[o]]), z)
-            limit = 2.0 * solids.bound[row, own[o]][3]
-            phi = wp.min(phi, distance(solids, row, own[o], local, wp.vec3f(), 0.0, limit)[3])
+            shape = solids.solid[row, own[o]]
+            local = wp.transform_point(wp.transform_inverse(shape.frame), z)
+            phi = wp.min(phi, distance_to(solids.values, shape, local, wp.vec3f(), 0.0, 2.0 * shape.bound[3])[3])
         return phi
 
     @wp.kernel(module="unique")
@@ -483,7 +480,7 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool) -> A
         offset = pairs.offset[env, at]
         first = cloud.first[row, geometry] + block
         sphere = cloud.sphere[first]
-        solid_row = env % solids.kind.shape[0]
+        solid_row = env % solids.solid.shape[0]
         # If even the bounding sphere lies above the release height, no point of the block can hold an anchor.
         middle = rotation @ (wp.vec3f(sphere[0], sphere[1], sphere[2]) - offset)
         if pad_gap(solids, pads.own, gel, solid_row, middle) - sphere[3] > gel.leave:
@@ -499,13 +496,12 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool) -> A
         if wp.static(not side_by_side):
             alone = gel.own_last - gel.own_first == 1
             if alone:
-                pad = pads.own[gel.own_first]
-                frame = wp.transform_inverse(solids.frame[solid_row, pad])
+                shape = solids.solid[solid_row, pads.own[gel.own_first]]
+                frame = wp.transform_inverse(shape.frame)
                 # Pose of the object and frame of the pad joined into one transform: each point then costs one product.
                 turn = wp.quat_to_matrix(wp.transform_get_rotation(frame)) @ rotation
                 shift = wp.transform_get_translation(frame) - turn @ offset
-                shape = shape_of(solids, solid_row, pad)
-                limit = 2.0 * solids.bound[solid_row, pad][3]
+                limit = 2.0 * shape.bound[3]
         for n in range(wp.static(BLOCK)):
             p = cloud.point[first * wp.static(BLOCK) + n]
             index = store * wp.static(BLOCK) + n

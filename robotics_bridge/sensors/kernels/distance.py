@@ -7,7 +7,7 @@ and the distance (m), negative inside. Letters: R variant row (1 or B environmen
 from __future__ import annotations
 
 from functools import cache
-from types import SimpleNamespace
+from typing import Any
 
 from brainbench.core.devices import warp
 
@@ -22,50 +22,42 @@ FAR = 1.0e6  # distance that stands for "out of reach" (m)
 
 
 @wp.struct
-class SolidArrays:
-    """The geometries of a scene on a device."""
+class SolidShape:
+    """One geometry of a scene."""
 
-    kind: wp.array2d(dtype=wp.int32)
-    """[R, G] number of the kind."""
-    size: wp.array2d(dtype=wp.vec3f)
-    """[R, G] (m), as in ``Geometry.size``; of a thin wall the rounding of its edges and its least
+    kind: wp.int32
+    """Number of the kind."""
+    size: wp.vec3f
+    """(m), as in ``Geometry.size``; of a thin wall the rounding of its edges and its least
     and largest thickness."""
-    frame: wp.array2d(dtype=wp.transformf)
-    """[R, G] pose in the frame of the link."""
-    bound: wp.array2d(dtype=wp.vec4f)
-    """[R, G] centre and radius of an enclosing sphere (m)."""
-    link: wp.array(dtype=wp.int32)
-    """[G]."""
-    field: wp.array2d(dtype=wp.int32)
-    """[R, G] number of the distance field, −1 for none."""
-    mesh: wp.array2d(dtype=wp.uint64)
-    """[R, G] id of the triangle tree."""
-    thickness: wp.array2d(dtype=wp.float32)
-    """[R, G] least width of a thin solid that is no wall (m), 0 for others."""
-    first: wp.array(dtype=wp.int32)
-    """[F] first sample of a field in ``values``."""
-    counts: wp.array(dtype=wp.vec3i)
-    """[F] samples along each axis."""
-    origin: wp.array(dtype=wp.vec3f)
-    """[F] position of the first sample (m)."""
-    spacing: wp.array(dtype=wp.float32)
-    """[F] (m)."""
-    values: wp.array(dtype=wp.float32)
-    """Samples of all fields (m)."""
+    bound: wp.vec4f
+    """Centre and radius of an enclosing sphere (m)."""
+    frame: wp.transformf
+    """Pose in the frame of the link."""
+    mesh: wp.uint64
+    """Id of the triangle tree."""
+    thickness: wp.float32
+    """Least width of a thin solid that is no wall (m), 0 for others."""
+    first: wp.int32
+    """First sample of its distance field in ``SolidArrays.values``."""
+    counts: wp.vec3i
+    """Samples along each axis."""
+    origin: wp.vec3f
+    """Position of the first sample (m)."""
+    spacing: wp.float32
+    """(m)."""
 
 
 @wp.struct
-class SolidShape:
-    """One geometry, read once for many points."""
+class SolidArrays:
+    """The geometries of a scene on a device."""
 
-    kind: wp.int32
-    size: wp.vec3f
-    mesh: wp.uint64
-    thickness: wp.float32
-    first: wp.int32
-    counts: wp.vec3i
-    origin: wp.vec3f
-    spacing: wp.float32
+    solid: wp.array2d(dtype=SolidShape)
+    """[R, G]."""
+    link: wp.array(dtype=wp.int32)
+    """[G]."""
+    values: wp.array(dtype=wp.float32)
+    """Samples of all distance fields (m)."""
 
 
 @wp.func
@@ -112,28 +104,28 @@ def cylinder(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
 
 
 @wp.func
+def signs(x: wp.vec3f) -> wp.vec3f:
+    """Return the octant of a point: 1 or −1 along each axis."""
+    return wp.vec3f(wp.where(x[0] < 0.0, -1.0, 1.0), wp.where(x[1] < 0.0, -1.0, 1.0), wp.where(x[2] < 0.0, -1.0, 1.0))
+
+
+@wp.func
 def box(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
     """Return normal and signed distance (m); ``size`` holds half the edges."""
     # By symmetry in one octant: length of the positive excesses outside, the largest of the three (all negative)
     # inside, with that face's normal.
-    ox = wp.abs(x[0]) - size[0]
-    oy = wp.abs(x[1]) - size[1]
-    oz = wp.abs(x[2]) - size[2]
-    sx = wp.where(x[0] < 0.0, -1.0, 1.0)
-    sy = wp.where(x[1] < 0.0, -1.0, 1.0)
-    sz = wp.where(x[2] < 0.0, -1.0, 1.0)
-    if ox > 0.0 or oy > 0.0 or oz > 0.0:
-        bx = wp.max(ox, 0.0)
-        by = wp.max(oy, 0.0)
-        bz = wp.max(oz, 0.0)
-        far = wp.sqrt(bx * bx + by * by + bz * bz)
-        inverse = 1.0 / far
-        return wp.vec4f(sx * bx * inverse, sy * by * inverse, sz * bz * inverse, far)
-    if ox >= oy and ox >= oz:
-        return wp.vec4f(sx, 0.0, 0.0, ox)
-    if oy >= oz:
-        return wp.vec4f(0.0, sy, 0.0, oy)
-    return wp.vec4f(0.0, 0.0, sz, oz)
+    sign = signs(x)
+    over = wp.cw_mul(sign, x) - size
+    if over[0] > 0.0 or over[1] > 0.0 or over[2] > 0.0:
+        outside = wp.max(over, wp.vec3f())
+        far = wp.length(outside)
+        n = wp.cw_mul(sign, outside) * (1.0 / far)
+        return wp.vec4f(n[0], n[1], n[2], far)
+    if over[0] >= over[1] and over[0] >= over[2]:
+        return wp.vec4f(sign[0], 0.0, 0.0, over[0])
+    if over[1] >= over[2]:
+        return wp.vec4f(0.0, sign[1], 0.0, over[1])
+    return wp.vec4f(0.0, 0.0, sign[2], over[2])
 
 
 @wp.func
@@ -141,7 +133,7 @@ def ellipsoid(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
     """Find the nearest point e² x / (e² + t), t the largest root of Σ (e x / (e² + t))² = 1, by halving."""
     # Coordinates of exactly zero hide the root at the short axis.
     shift = 1.0e-6 * wp.min(size)
-    y = wp.vec3f(wp.max(wp.abs(x[0]), shift), wp.max(wp.abs(x[1]), shift), wp.max(wp.abs(x[2]), shift))
+    y = wp.max(wp.abs(x), wp.vec3f(shift))
     # The sum decreases steadily beyond t = −min e², so halving finds the root for any ratio of axes; Newton steps
     # overshoot near the centre of flat ellipsoids. Octant by symmetry, sign restored at the end.
     short = wp.min(size)
@@ -162,10 +154,8 @@ def ellipsoid(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
     near = wp.cw_div(wp.cw_mul(squares, y), squares + wp.vec3f(t))
     n = wp.normalize(wp.cw_div(near, squares))
     distance = wp.dot(y - near, n)
-    sx = wp.where(x[0] < 0.0, -1.0, 1.0)
-    sy = wp.where(x[1] < 0.0, -1.0, 1.0)
-    sz = wp.where(x[2] < 0.0, -1.0, 1.0)
-    return wp.vec4f(sx * n[0], sy * n[1], sz * n[2], distance)
+    n = wp.cw_mul(signs(x), n)
+    return wp.vec4f(n[0], n[1], n[2], distance)
 
 
 @wp.func
@@ -312,14 +302,11 @@ def sample_field(mesh: wp.uint64, origin: wp.vec3f, spacing: float, reach: float
 
 
 @cache
-def shape_functions(kinds: frozenset[int], raycast: bool) -> SimpleNamespace:
-    """Return the functions that find distances for the kinds a scene has.
+def distance_function(kinds: frozenset[int], raycast: bool) -> Any:
+    """Return ``distance_to(solids.values, shape, x, facing, side, reach) -> (normal, distance)`` for a scene's kinds.
 
-    ``shape_of(solids, row, geometry)`` reads what is known of a geometry, once for many points;
-    ``distance_to(solids.values, shape, x, facing, side, reach) -> (normal, distance)`` asks it, where ``facing`` is the
-    outward normal of the sensor times its radius, or 0 for a distance that knows no side, and ``side`` is 1 where
-    contacts push on the sensor's side, −1 on the other one, 0 where none tells;
-    ``distance(solids, row, geometry, x, facing, side, reach)`` does both.
+    ``facing`` is the outward normal of the sensor times its radius, or 0 for a distance that knows no side, and
+    ``side`` is 1 where contacts push on the sensor's side, −1 on the other one, 0 where none tells.
 
     Args:
         kinds: only their code is compiled.
@@ -327,26 +314,7 @@ def shape_functions(kinds: frozenset[int], raycast: bool) -> SimpleNamespace:
     """
     curved = not raycast
     has_triangles = raycast and bool(kinds - {PLANE, WALL, THIN})
-    sized = WALL in kinds or (curved and bool(kinds - {PLANE, MESH, THIN}))
     thin = curved and THIN in kinds
-
-    @wp.func
-    def shape_of(solids: SolidArrays, row: int, geometry: int) -> SolidShape:
-        shape = SolidShape()
-        shape.kind = solids.kind[row, geometry]
-        if wp.static(sized):
-            shape.size = solids.size[row, geometry]
-        if wp.static(has_triangles or WALL in kinds):
-            shape.mesh = solids.mesh[row, geometry]
-        if wp.static(thin):
-            shape.thickness = solids.thickness[row, geometry]
-        if wp.static(curved and MESH in kinds):
-            number = wp.max(solids.field[row, geometry], 0)
-            shape.first = solids.first[number]
-            shape.counts = solids.counts[number]
-            shape.origin = solids.origin[number]
-            shape.spacing = solids.spacing[number]
-        return shape
 
     @wp.func
     def nearest(values: wp.array(dtype=wp.float32), shape: SolidShape, x: wp.vec3f, reach: float) -> wp.vec4f:
@@ -422,10 +390,4 @@ def shape_functions(kinds: frozenset[int], raycast: bool) -> SimpleNamespace:
                 return beyond(values, shape, x, facing, side, found)
         return found
 
-    @wp.func
-    def distance(
-        solids: SolidArrays, row: int, geometry: int, x: wp.vec3f, facing: wp.vec3f, side: float, reach: float
-    ) -> wp.vec4f:
-        return distance_to(solids.values, shape_of(solids, row, geometry), x, facing, side, reach)
-
-    return SimpleNamespace(shape_of=shape_of, distance_to=distance_to, distance=distance)
+    return distance_to

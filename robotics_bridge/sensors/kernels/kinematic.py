@@ -14,7 +14,7 @@ from typing import Any
 from brainbench.core.devices import warp
 from robotics_bridge.sensors.context import numbers_of
 from robotics_bridge.sensors.kernels.contact_load import ContactFaces, SpreadPlan
-from robotics_bridge.sensors.kernels.distance import FAR, SIDED, SolidArrays, SolidShape, shape_functions
+from robotics_bridge.sensors.kernels.distance import FAR, SIDED, SolidArrays, SolidShape, distance_function
 from robotics_bridge.sensors.kernels.noise import NoiseParams, episode_draw, radius_noise
 from robotics_bridge.sensors.kernels.noise import power as series_power
 from robotics_bridge.sensors.kernels.pairs import PairArrays, push_side
@@ -65,7 +65,7 @@ def hold(
 ) -> wp.vec3f:
     """Return σ of a taxel at ``x`` that lies ``depth`` deep in what its list names at ``place``; ``law`` is (μ, ρ)."""
     geometry = pairs.geometry[env, place]
-    frame = solids.frame[env % solids.kind.shape[0], geometry]
+    frame = solids.solid[env % solids.solid.shape[0], geometry].frame
     rotation = pairs.rotation[env, place]
     offset = pairs.offset[env, place]
     body = solids.link[geometry]
@@ -180,8 +180,7 @@ def kinematic_kernel(
         cuda: a GPU runs it, with square roots and quotients of its approximate units (2 units in the last place).
         single: every row is one taxel; nothing is kept for another.
     """
-    shapes, readout = shape_functions(kinds, raycast), readout_functions(mode, hysteresis, walk)
-    shape_of, distance_to = shapes.shape_of, shapes.distance_to
+    distance_to, readout = distance_function(kinds, raycast), readout_functions(mode, hysteresis, walk)
     emit_six, recall_six = readout.emit_six, readout.recall_six
     fast = cuda and not raycast
     wrench = kinematic_function(physical, sticky, fast)
@@ -228,7 +227,7 @@ def kinematic_kernel(
                 return
         slot = probes.slot[span[0]]
         variant = int(0)
-        if solids.kind.shape[0] > 1:
+        if solids.solid.shape[0] > 1:
             variant = env
         first = pairs.first[slot]
         count = pairs.count[env, slot]
@@ -252,7 +251,7 @@ def kinematic_kernel(
             radius = packed[3]
             if radius > 0.0:
                 # Memory is asked for first: the distances below are worked out while it arrives.
-                lag, drift = recall_six(io, env, n, age)
+                lag, drift = recall_six(io, env, n)
                 x = wp.vec3f(packed[0], packed[1], packed[2])
                 best = float(wp.static(FAR))
                 normal = wp.vec3f(0.0, 0.0, 1.0)
@@ -261,12 +260,11 @@ def kinematic_kernel(
                     # Most links meet one geometry: it is read for the first probe only.
                     while held != first + k:
                         held = first + k
-                        geometry = pairs.geometry[env, held]
-                        shape = shape_of(solids, variant, geometry)
+                        shape = solids.solid[variant, pairs.geometry[env, held]]
                         rotation = pairs.rotation[env, held]
                         offset = pairs.offset[env, held]
                         if wp.static(raycast or bool(kinds & SIDED)):
-                            limit = 2.0 * solids.bound[variant, geometry][3]
+                            limit = 2.0 * shape.bound[3]
                     facing = wp.vec3f()
                     side = float(0.0)
                     if wp.static(bool(kinds & SIDED)):
@@ -329,7 +327,7 @@ def kinematic_kernel(
                     if wp.static(mode == CLEAN):
                         store_planes(io.truth, env, n, 6, truth)
                     else:
-                        emit_six(io, io.knobs[part], env, n, probe, age, episode, fixed, lag, drift, truth, signal)
+                        emit_six(io, env, n, fixed, lag, drift, truth, signal)
             elif wp.static(not summed):
                 silenced(io, 6, env, n, radius)
             n += span[2]
@@ -354,15 +352,12 @@ def measure_kernel(hysteresis: bool, walk: bool) -> Any:
         n = int(tid % count)
         if silenced(io, 6, env, n, probes.radius[n]):
             return
-        age = io.age[env]
-        lag, drift = recall_six(io, env, n, age)
-        part = io.part[n]
+        lag, drift = recall_six(io, env, n)
         # What nothing touches was not written.
         signal = wp.spatial_vectorf()
         if press.filled[env, n] != wp.uint8(0):
             signal = load_planes(io.measured, env, n, 6)
-        probe = io.probe[n]
-        fixed = episode_draw(io.knobs[part], env + io.env_offset, probe, io.episode[env])
-        emit_six(io, io.knobs[part], env, n, probe, age, io.episode[env], fixed, lag, drift, signal, signal)
+        fixed = episode_draw(io.knobs[io.part[n]], env + io.env_offset, io.probe[n], io.episode[env])
+        emit_six(io, env, n, fixed, lag, drift, signal, signal)
 
     return measure

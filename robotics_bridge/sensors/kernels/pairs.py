@@ -208,7 +208,7 @@ def list_pairs(
         return
     env = tid // many
     slot = tid % many
-    row = env % solids.kind.shape[0]
+    row = env % solids.solid.shape[0]
     link = slots.link[slot]
     here = state.pose[env, link]
     origin = wp.transform_get_translation(here)
@@ -240,11 +240,11 @@ def list_pairs(
         if wanted == 1:
             geometry = slots.members[members + place]
             there = state.pose[env, solids.link[geometry]]
-            frame = wp.transform_multiply(there, solids.frame[row, geometry])
+            frame = wp.transform_multiply(there, solids.solid[row, geometry].frame)
             relative = wp.transform_multiply(wp.transform_inverse(frame), here)
             near = True
-            if slots.reach[slot] > 0.0 and solids.kind[row, geometry] != wp.static(PLANE):
-                bound = solids.bound[row, geometry]
+            if slots.reach[slot] > 0.0 and solids.solid[row, geometry].kind != wp.static(PLANE):
+                bound = solids.solid[row, geometry].bound
                 center = wp.transform_point(relative, slots.center[slot])
                 # Sphere around the probes against sphere around the geometry: planes have none and always count.
                 gap = wp.length(center - wp.vec3f(bound[0], bound[1], bound[2]))

@@ -10,7 +10,7 @@ from functools import cache
 from typing import Any
 
 from brainbench.core.devices import warp
-from robotics_bridge.sensors.kernels.distance import FAR, SIDED, SolidArrays, shape_functions
+from robotics_bridge.sensors.kernels.distance import FAR, SIDED, SolidArrays, distance_function
 from robotics_bridge.sensors.kernels.noise import episode_draw, radius_noise
 from robotics_bridge.sensors.kernels.pairs import PairArrays, push_side
 from robotics_bridge.sensors.kernels.readout import CLEAN, ProbeArrays, ReadoutArrays, readout_functions, silenced
@@ -25,11 +25,11 @@ def deepest_function(kinds: frozenset[int], raycast: bool) -> Any:
     The least signed distance of a probe to what its slot lists, the outward normal there and its place in the list
     (−1: nothing). ``reach`` 0 means: whatever lies inside or within the probe's radius.
     """
-    distance = shape_functions(kinds, raycast).distance
+    distance_to = distance_function(kinds, raycast)
 
     @wp.func
     def deepest(probes: ProbeArrays, solids: SolidArrays, pairs: PairArrays, env: int, n: int, reach: float):
-        row = env % solids.kind.shape[0]
+        row = env % solids.solid.shape[0]
         slot = probes.slot[n]
         x = probes.position[n]
         first = pairs.first[slot]
@@ -52,8 +52,9 @@ def deepest_function(kinds: frozenset[int], raycast: bool) -> Any:
                 # A query of triangles searches within a limit: from inside, the surface is at most a bounding diameter
                 # away.
                 if reach <= 0.0:
-                    limit = 2.0 * solids.bound[row, geometry][3] + probes.radius[n]
-            found = distance(solids, row, geometry, rotation @ x + pairs.offset[env, at], facing, side, limit)
+                    limit = 2.0 * solids.solid[row, geometry].bound[3] + probes.radius[n]
+            shape = solids.solid[row, geometry]
+            found = distance_to(solids.values, shape, rotation @ x + pairs.offset[env, at], facing, side, limit)
             # The largest penetration of 4.2 is the least signed distance. A strict comparison keeps the first of equals
             # in the order of geometry numbers, so that ties do not depend on the order of contacts.
             if found[3] < best:
@@ -117,9 +118,9 @@ def probe_kernel(kinds: frozenset[int], raycast: bool, reads: str, mode: int, hy
             truth = latch(io.truth[0, env, n], age, truth, limits[part])
         if wp.static(binary and mode != CLEAN):
             bit = io.measured[0, env, n]
-            emit(io, io.knobs[part], env, n, probe, truth, signal)
+            emit(io, env, n, truth, signal)
             io.measured[0, env, n] = latch(bit, age, io.measured[0, env, n], limits[part])
         else:
-            emit(io, io.knobs[part], env, n, probe, truth, signal)
+            emit(io, env, n, truth, signal)
 
     return read_probes

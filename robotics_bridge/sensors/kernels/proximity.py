@@ -135,13 +135,13 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool) ->
             part = io.part[n]
             probe = io.probe[n]
             x = probes.position[n]
-            age = io.age[env]
             episode = io.episode[env]
             noisy = radius
             if wp.static(mode != CLEAN):
                 # Both branches share one pass over the points: the query reaches as far as the larger of the two radii
                 # (4.23).
-                noisy = wp.max(radius + radius_noise(io.knobs[part], env + io.env_offset, probe, age, episode), 0.0)
+                error = radius_noise(io.knobs[part], env + io.env_offset, probe, io.age[env], episode)
+                noisy = wp.max(radius + error, 0.0)
             reach = wp.max(radius, noisy)
             turning = wp.vec3f(0.0)
             mass = wp.vec2f(0.0)
@@ -211,7 +211,7 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool) ->
                 # The gain (4.24) scales the summed overlaps; the wrench is linear in them, so it is applied to the
                 # result.
                 signal = fixed[0] * wrench(own.laws[part], density, x, normal, mass[1], moment_noisy, slip_noisy)
-            lag, drift = recall_six(io, env, n, age)
-            emit_six(io, io.knobs[part], env, n, probe, age, episode, fixed, lag, drift, truth, signal)
+            lag, drift = recall_six(io, env, n)
+            emit_six(io, env, n, fixed, lag, drift, truth, signal)
 
     return proximity

@@ -10,7 +10,6 @@ from types import SimpleNamespace
 
 from brainbench.core.devices import warp
 from robotics_bridge.sensors.kernels.noise import (
-    NoiseParams,
     ReadoutArrays,
     apply_drawn,
     decay,
@@ -193,11 +192,11 @@ def readout_functions(
     Normals = wp.types.matrix(shape=(pairs, 4), dtype=wp.float32)
 
     @wp.func
-    def recall_six(io: ReadoutArrays, env: int, n: int, age: int):
+    def recall_six(io: ReadoutArrays, env: int, n: int):
         lag = wp.spatial_vectorf()
         drift = wp.spatial_vectorf()
         # Before the first update the memories count as zero, whatever the arrays hold: a reset has nothing to clear.
-        if age > 0:
+        if io.age[env] > 0:
             if wp.static(hysteresis):
                 lag = load_planes(io.hysteresis, env, n, wp.static(channels))
             if wp.static(walk):
@@ -206,24 +205,16 @@ def readout_functions(
 
     @wp.func
     def emit_six(
-        io: ReadoutArrays,
-        knobs: NoiseParams,
-        env: int,
-        n: int,
-        probe: int,
-        age: int,
-        episode: int,
-        fixed: wp.vec3f,
-        lag: wp.spatial_vectorf,
-        drift: wp.spatial_vectorf,
-        truth: wp.spatial_vectorf,
-        signal: wp.spatial_vectorf,
-    ):
+        io: ReadoutArrays, env: int, n: int, fixed: wp.vec3f, lag: wp.spatial_vectorf, drift: wp.spatial_vectorf,
+        truth: wp.spatial_vectorf, signal: wp.spatial_vectorf,
+    ):  # fmt: skip
         if wp.static(exact):
             store_planes(io.truth, env, n, wp.static(channels), truth)
         if wp.static(mode == STAGED):
             store_planes(io.measured, env, n, wp.static(channels), signal)
         if wp.static(mode == FUSED):
+            knobs = io.knobs[io.part[n]]
+            number = env + io.env_offset
             fading = float(0.0)
             if wp.static(hysteresis):
                 if knobs.hysteresis != 0.0:
@@ -233,7 +224,7 @@ def readout_functions(
             z = Normals()
             if knobs.white > 0.0 or knobs.walk > 0.0:
                 for pair in range(wp.static(pairs)):
-                    z[pair] = pair_normals(knobs, env + io.env_offset, probe, pair, age, episode)
+                    z[pair] = pair_normals(knobs, number, io.probe[n], pair, io.age[env], io.episode[env])
             for channel in range(wp.static(channels)):
                 white = z[channel // 2, 2 * (channel % 2)]
                 step = z[channel // 2, 2 * (channel % 2) + 1]
@@ -245,16 +236,14 @@ def readout_functions(
                     io.walk[channel, env, n] = y[2]
 
     @wp.func
-    def emit(io: ReadoutArrays, knobs: NoiseParams, env: int, n: int, probe: int, truth: float, signal: float):
-        age = io.age[env]
-        episode = io.episode[env]
+    def emit(io: ReadoutArrays, env: int, n: int, truth: float, signal: float):
         fixed = wp.vec3f()
         if wp.static(mode == FUSED):
-            fixed = episode_draw(knobs, env + io.env_offset, probe, episode)
-        lag, drift = recall_six(io, env, n, age)
+            fixed = episode_draw(io.knobs[io.part[n]], env + io.env_offset, io.probe[n], io.episode[env])
+        lag, drift = recall_six(io, env, n)
         all_truth = wp.spatial_vectorf(truth, 0.0, 0.0, 0.0, 0.0, 0.0)
         all_signal = wp.spatial_vectorf(signal, 0.0, 0.0, 0.0, 0.0, 0.0)
-        emit_six(io, knobs, env, n, probe, age, episode, fixed, lag, drift, all_truth, all_signal)
+        emit_six(io, env, n, fixed, lag, drift, all_truth, all_signal)
 
     return SimpleNamespace(emit=emit, emit_six=emit_six, recall_six=recall_six)
 

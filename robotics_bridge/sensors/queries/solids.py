@@ -21,7 +21,7 @@ from brainbench.geometry import Mesh
 from brainbench.geometry.mesh import repair, sample_surface
 from robotics_bridge.physics.scene import KINDS, Geometry, TouchScene
 from robotics_bridge.sensors.kernels import distance
-from robotics_bridge.sensors.kernels.distance import OTHER, THIN, WALL, SolidArrays, measure_walls
+from robotics_bridge.sensors.kernels.distance import OTHER, THIN, WALL, SolidArrays, SolidShape, measure_walls
 from robotics_bridge.sensors.kernels.proximity import BLOCK, CellArrays, CloudArrays
 from robotics_bridge.sensors.probes.placement import cover_evenly, face_areas
 
@@ -138,24 +138,15 @@ def least_width(geometry: Geometry) -> float:
 
 def bounding_sphere(geometry: Geometry) -> NDArray[np.float32]:
     """Return centre and radius (x, y, z, r) [m] of a sphere around a geometry, in its own frame."""
-    size = (*geometry.size, 0.0, 0.0, 0.0)
-    center, radius = np.zeros(3), _UNBOUNDED
-    if geometry.kind == "sphere":
-        radius = size[0]
-    elif geometry.kind == "capsule":
-        radius = size[0] + size[1]
-    elif geometry.kind == "cylinder":
-        # Distance of the rim from the middle.
-        radius = float(np.hypot(size[0], size[1]))
-    elif geometry.kind == "ellipsoid":
-        radius = max(size)
-    elif geometry.kind == "box":
-        radius = float(np.linalg.norm(size[:3]))
-    elif geometry.mesh is not None:
+    if geometry.mesh is not None:
         # Middle of the box, not the mean of the vertices, which are dense where the surface is curved.
         center = geometry.mesh.bounds.mean(axis=0)
-        radius = float(np.linalg.norm(geometry.mesh.vertices - center, axis=1).max())
-    return np.array([*center, radius], dtype=np.float32)
+        radius = np.linalg.norm(geometry.mesh.vertices - center, axis=1).max()
+        return np.array([*center, radius], dtype=np.float32)
+    size = geometry.size
+    radii = {"sphere": max, "ellipsoid": max, "capsule": sum, "cylinder": np.linalg.norm, "box": np.linalg.norm}
+    radius = radii[geometry.kind](size) if geometry.kind in radii else _UNBOUNDED
+    return np.array([0.0, 0.0, 0.0, radius], dtype=np.float32)
 
 
 def tessellate(geometry: Geometry) -> Mesh:
@@ -202,50 +193,26 @@ class Solids:
     ) -> None:
         self.scene, self.device = scene, device
         self.rows = num_envs if scene.variants else 1
-        count = max(len(scene.geometries), 1)
         # One row serves all environments unless shapes differ: kernels take row env % rows.
-        shape = (self.rows, count)
-        self.kinds = np.full(shape, OTHER, dtype=np.int32)
-        size, bound = np.ones((*shape, 3), np.float32), np.zeros((*shape, 4), np.float32)
-        frame = np.zeros((*shape, 7), np.float32)
-        frame[..., 6] = 1
-        field, mesh = np.full(shape, -1, np.int32), np.zeros(shape, np.uint64)
-        self._thickness = np.zeros(shape, np.float32)
+        solids = np.zeros((self.rows, max(len(scene.geometries), 1)), np.dtype(SolidShape.numpy_dtype()))
+        solids["kind"] = OTHER
+        self.kinds, self._thickness = solids["kind"], solids["thickness"]
+        """[R, G] numbers of the kinds."""
         self._sound: dict[str, Mesh] = {}
-        self._fields: dict[str, Field] = {}
+        self._fields: dict[str, tuple[int, Field]] = {}
         self._trees: dict[str, Any] = {}
         for index in range(len(scene.geometries)):
-            seen: dict[int, tuple] = {}
+            seen: dict[int, dict[str, Any]] = {}
             for row in range(self.rows if index in scene.variants else 1):
                 geometry = scene.geometry_in(row, index)
                 if id(geometry) not in seen:
                     wanted = ("sdf", index) in queries, ("raycast", index) in queries
                     seen[id(geometry)] = self._describe(geometry, *wanted, resolution)
-                rows = row if index in scene.variants else slice(None)
-                described = seen[id(geometry)]
-                self.kinds[rows, index], size[rows, index], bound[rows, index] = described[:3]
-                frame[rows, index], field[rows, index], mesh[rows, index] = described[3:6]
-                self._thickness[rows, index] = described[6]
-        volumes = list(self._fields.values()) or [Field(np.zeros((2, 2, 2), np.float32), np.zeros(3, np.float32), 1.0)]
-        starts = np.cumsum([0, *(v.values.size for v in volumes)])
-        if starts[-1] >= 2**31:
-            raise UsageError("The distance fields hold more than 2³¹ samples together; lower the resolution.")
-        arrays = {
-            "kind": self.kinds,
-            "size": size,
-            "frame": frame,
-            "bound": bound,
-            "link": scene.link_of,
-            "field": field,
-            "mesh": mesh,
-            "thickness": self._thickness,
-            "first": starts[:-1],
-            "counts": [v.values.shape for v in volumes],
-            "origin": [v.origin for v in volumes],
-            "spacing": [v.spacing for v in volumes],
-            "values": np.concatenate([v.values.ravel() for v in volumes]),
-        }
-        self.struct: Any = to_struct(SolidArrays, {k: np.asarray(v) for k, v in arrays.items()}, device)
+                for name, value in seen[id(geometry)].items():
+                    solids[name][row if index in scene.variants else slice(None), index] = value
+        samples = [field.values.ravel() for _first, field in self._fields.values()] or [np.zeros(8, np.float32)]
+        arrays = {"solid": solids, "link": scene.link_of, "values": np.concatenate(samples)}
+        self.struct: Any = to_struct(SolidArrays, arrays, device)
         """The Warp structure that kernels take."""
 
     @property
@@ -270,9 +237,14 @@ class Solids:
         thin = chosen and bool((self._thickness[:, chosen] > 0).any())
         return (kinds - {OTHER}) | ({THIN} if thin else set())
 
-    def _describe(self, geometry: Geometry, field: bool, tree: bool, resolution: int) -> tuple:
-        """Return kind, size, bounding sphere, frame, number of the distance field, id of the tree and thickness."""
-        number, mesh, kind, size = -1, 0, KINDS.index(geometry.kind), [*geometry.size, 0.0, 0.0, 0.0][:3]
+    def _describe(self, geometry: Geometry, field: bool, tree: bool, resolution: int) -> dict[str, Any]:
+        """Return the fields of ``SolidShape`` for a geometry that sensors ask by its distance field or its tree."""
+        kind, size = KINDS.index(geometry.kind), [*geometry.size, 0.0, 0.0, 0.0][:3]
+        w, x, y, z = geometry.quaternion
+        # Ours are (w, x, y, z), Warp's (x, y, z, w).
+        frame = (*geometry.position, x, y, z, w)
+        # A field that nobody asks has cells, too.
+        solid = {"bound": bounding_sphere(geometry), "frame": frame, "counts": 2, "spacing": 1.0}
         thin = width if (width := least_width(geometry)) < THINNEST else 0.0
         if (geometry.mesh is not None and (field or tree)) or (thin and tree):
             surface = self._solid(geometry.mesh) if geometry.mesh is not None else tessellate(geometry)
@@ -285,20 +257,25 @@ class Solids:
                 size = [0.01 * least / float(np.linalg.norm(edges, axis=2).mean()), least, thin]
                 kind, field, tree, thin = WALL, False, True, 0.0
             if field:
-                key = surface.content_hash
-                if key not in self._fields:
-                    self._fields[key] = sample_field(surface, resolution, self.device)
-                number = list(self._fields).index(key)
+                solid |= self._field(surface, resolution)
         if tree and geometry.kind not in ("plane", "other"):
             surface = tessellate(geometry) if geometry.mesh is None else self._solid(geometry.mesh)
             key = surface.content_hash
             if key not in self._trees:
                 self._trees[key] = mesh_tree(surface, self.device)
-            mesh = self._trees[key].id
-        w, x, y, z = geometry.quaternion
-        # Ours are (w, x, y, z), Warp's (x, y, z, w).
-        frame = (*geometry.position, x, y, z, w)
-        return kind, size, bounding_sphere(geometry), frame, number, mesh, thin
+            solid["mesh"] = self._trees[key].id
+        return {**solid, "kind": kind, "size": size, "thickness": thin}
+
+    def _field(self, surface: Mesh, resolution: int) -> dict[str, Any]:
+        """Return where the distance field of a surface lies; equal surfaces share one."""
+        key = surface.content_hash
+        if key not in self._fields:
+            first = sum(field.values.size for _first, field in self._fields.values())
+            self._fields[key] = first, sample_field(surface, resolution, self.device)
+            if first + self._fields[key][1].values.size >= 2**31:
+                raise UsageError("The distance fields hold more than 2³¹ samples together; lower the resolution.")
+        first, field = self._fields[key]
+        return {"first": first, "counts": field.values.shape, "origin": field.origin, "spacing": field.spacing}
 
     def _solid(self, mesh: Mesh) -> Mesh:
         """Return a mesh mended, once for all that share it."""

@@ -150,7 +150,7 @@ class ContactLoadRuntime(KinematicRuntime):
         if self.faces.face.shape[0] < 2 * room:
             self._room(room)
         plan, faces, link_of = self.plan, self.faces, c.solids.struct.link
-        scene = [link_of, state.arrays, state.contact_friction]
+        scene = [link_of, state.arrays]
         # A processor takes all contacts in one thread, so that the launch stays the same whatever their number.
         threads = max(room, 1) if cuda else 1
         c.launch(list_contacts, threads, plan, c.pairs.plan, link_of, state.arrays, threads, faces)

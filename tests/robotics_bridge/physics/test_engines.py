@@ -168,22 +168,19 @@ def test_the_kernel_of_the_gpu_engine_reads_forces_as_mujoco_does(cone: str, con
     contact, many = data.contact, 10
     rows = np.where(np.arange(many) < np.where(contact.dim > 1, 2 * (contact.dim - 1), 1)[:, None], np.arange(many), -1)
     address = np.where((rows >= 0) & (contact.efc_address[:, None] >= 0), contact.efc_address[:, None] + rows, -1)
-    normal, friction, couple = (wp.zeros(count, dtype=wp.vec3f) for _ in range(3))
-    force = wp.zeros(count, dtype=float)
+    found, state = HandState.empty(1, model.nbody, count), engine.state
+    found.contact_count.fill_(count)
     inputs = [
-        wp.array([count], dtype=int), wp.zeros(count, dtype=int),
-        wp.array(contact.frame.reshape(-1, 3, 3), dtype=wp.mat33f),
-        wp.array(contact.dim, dtype=int), wp.array(address, dtype=int), wp.array(data.efc_force[None], dtype=float),
-        wp.array(contact.friction, dtype=Five), int(model.opt.cone == 0), normal, force, friction, couple,
+        wp.array(contact.frame.reshape(-1, 3, 3), dtype=wp.mat33f), wp.array(contact.dim, dtype=int),
+        wp.array(address, dtype=int), wp.array(data.efc_force[None], dtype=float),
+        wp.array(contact.friction, dtype=Five), int(model.opt.cone == 0), found.arrays,
     ]  # fmt: skip
     wp.launch(fill_contacts, dim=count, inputs=inputs)
-    state = engine.state
-    for found, known in ((normal, state.contact_normal), (force, state.contact_force)):
-        np.testing.assert_allclose(found.numpy(), known.numpy()[:count], rtol=1e-5, atol=1e-4)
-    np.testing.assert_allclose(friction.numpy(), state.contact_friction.numpy()[:count], rtol=1e-5, atol=1e-4)
-    assert np.abs(friction.numpy()).max() > 0.1
-    np.testing.assert_allclose(couple.numpy(), state.contact_couple.numpy()[:count], rtol=1e-5, atol=1e-6)
-    assert (np.abs(couple.numpy()).max() > 1e-4) == (condim > 3)
+    for name, atol in {"normal": 1e-4, "force": 1e-4, "friction": 1e-4, "couple": 1e-6}.items():
+        read, known = (getattr(each, f"contact_{name}").numpy()[:count] for each in (found, state))
+        np.testing.assert_allclose(read, known, rtol=1e-5, atol=atol, err_msg=name)
+    assert np.abs(found.contact_friction.numpy()).max() > 0.1
+    assert (np.abs(found.contact_couple.numpy()).max() > 1e-4) == (condim > 3)
 
 
 @pytest.mark.slow
