@@ -237,7 +237,8 @@ def check_number(
     whole: bool = False,
 ) -> None:
     """Raise a :class:`UsageError` unless ``value`` is a finite number within all bounds, and whole if asked for."""
-    kind = issubclass(type(value), numbers.Integral if whole else numbers.Real) and not isinstance(value, bool)
+    plain = type(value) is int or (type(value) is float and not whole)
+    kind = plain or (issubclass(type(value), numbers.Integral if whole else numbers.Real) and type(value) is not bool)
     if kind and -math.inf < value < math.inf and least <= value <= most and above < value < below:
         return
     bounds = {"at least": least, "at most": most, "above": above, "below": below}

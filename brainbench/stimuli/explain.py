@@ -80,8 +80,7 @@ def plan(scenes: Sequence[Scene], *, surfaces: bool = False) -> JobSchedule:
 
 def reach_of(job: Job, *, surfaces: bool = False) -> Reach:
     """Return what of its obstacles the whisker of this job could ever touch."""
-    duration = job.times[-1] - job.start
-    times = np.linspace(job.start, job.times[-1], max(2, math.ceil(duration * SAMPLING)))
+    times = np.linspace(job.start, job.times[-1], max(2, math.ceil((job.times[-1] - job.start) * SAMPLING)))
     return reachable(job.whisker, job.follicle.pose(times)[0], job.obstacles, times, surfaces=surfaces)
 
 

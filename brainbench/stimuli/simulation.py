@@ -201,8 +201,7 @@ def simulate_uncached(
     report = None if progress is None else lambda done, total: progress(done, total, "simulating whiskers")
     traces = engine.run(planned.jobs, fidelity, progress=report, workers=workers)
     clock.append(time.perf_counter())
-    rows = [[traces[index] for index in row] for row in planned.places]
-    dataset = _assemble(scenes, rows, fidelity, engine.name)
+    dataset = _assemble(scenes, [[traces[i] for i in row] for row in planned.places], fidelity, engine.name)
     clock.append(time.perf_counter())
     seconds = dict(zip(("plan", "simulate", "assemble"), np.diff(clock).tolist(), strict=True))
     dataset.attrs[ATTRIBUTE] = to_json(explain(scenes, planned, traces, fidelity), indent=None)
@@ -387,8 +386,7 @@ def record(
     moments = tuple(bending_moments(job, points) for job, points in zip(jobs, local, strict=True))
     # Jobs stand in the frame of their array as it was at t = 0.
     places = zip(local, scene.axes, scene.origins, strict=True)
-    joints = tuple(points @ axes.T + origin for points, axes, origin in places)
-    return Recording(scene, times, joints, moments)
+    return Recording(scene, times, tuple(points @ axes.T + origin for points, axes, origin in places), moments)
 
 
 def bending_moments(job: Job, joints: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,13 +134,11 @@ def changes(
     (:func:`lateness`) does. Other arguments are those of :func:`difference`.
     """
     calm = ~start_jump(values[:, :, None, :3], finer[:, :, None, :3])[:, :, 0]
-    beside, course = (
-        np.maximum(np.pad(part, ((0, 0), (0, 1), (0, 0))), np.pad(part, ((0, 0), (1, 0), (0, 0))))
-        for part in (contact[:, 1:, None] != contact[:, :-1, None], _sizes(np.diff(finer, axis=1)))
-    )
+    between = (contact[:, 1:, None] != contact[:, :-1, None], _sizes(finer[:, 1:] - finer[:, :-1]))
+    padded = (np.pad(part, ((0, 0), (1, 1), (0, 0))) for part in between)
+    beside, course = (np.maximum(part[:, 1:], part[:, :-1]) for part in padded)
     gaps = _sizes(values - finer)
-    least = np.broadcast_to(shift, len(values))[:, None, None] * course
-    gaps = np.where(beside, BESIDE_TOUCH * np.maximum(gaps, least), gaps)
+    gaps = np.where(beside, BESIDE_TOUCH * np.maximum(gaps, np.reshape(shift, (-1, 1, 1)) * course), gaps)
     counted = finer.astype(float)
     counted[:, :, ::3] += gaps
     return difference(counted, finer, contact, lengths, calm).max(axis=1)
@@ -194,6 +193,7 @@ def divided_step(fidelity: Fidelity, divisor: int, whisker: Whisker, spacing: fl
     )
 
 
+@lru_cache(1024)
 def halved_step(fidelity: Fidelity, whisker: Whisker, spacing: float) -> Fidelity:
     """Return a fidelity with half of these steps, of those too that an object near cuts, and solved contact forces."""
     return replace(
@@ -203,6 +203,7 @@ def halved_step(fidelity: Fidelity, whisker: Whisker, spacing: float) -> Fidelit
     )
 
 
+@lru_cache(1024)
 def more_links(fidelity: Fidelity, whisker: Whisker) -> Fidelity:
     """Return a fidelity with half as many links again, or with a third fewer where there can be no more."""
     count = fidelity.link_count(whisker.arc_length)

@@ -10,7 +10,7 @@ import logging
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import field, replace
-from functools import cache
+from functools import cache, lru_cache
 from importlib import resources
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -93,6 +93,7 @@ class Fidelity:
         return value if isinstance(value, Fidelity) else cls.parse(value or "balanced")
 
     @classmethod
+    @lru_cache(64)
     def parse(cls, text: str) -> Fidelity:
         """Return a preset with some values replaced, as ``balanced`` or ``fast,links=12,solver=quasistatic``.
 

@@ -147,8 +147,7 @@ class Cutting:
 
         ``finest`` is the shortest period (s) of anything in it, None when unknown.
         """
-        spans = self.stop - self.start, self.longest_step
-        cells = sum(max(1, math.ceil(span / KNOT - 1e-9)) for span in spans)
+        cells = sum(max(1, math.ceil(span / KNOT - 1e-9)) for span in (self.stop - self.start, self.longest_step))
         wanted = KNOT / min(self.step, KNOT / LOOKS) if finest is None else 16 * KNOT / finest
         looks = int(2 ** math.ceil(math.log2(min(max(wanted, 4), 4 * MOST_PIECES))))
         motion = _Sampled(path, self.start, what)

@@ -160,10 +160,7 @@ def stays_in_plane(
     turns = base_rotation(euler)
     paths = [None if obstacle.motion is None else obstacle.motion(times) for obstacle in reach.obstacles]
     pulls = (job.gravity,) if job.air_flow is None else (job.gravity, job.air_flow)
-    forces = [
-        *(np.asarray(pull, dtype=float) for pull in pulls),
-        *(np.asarray(load.force, dtype=float) for load in job.loads),
-    ]
+    forces = [np.asarray(force, dtype=float) for force in (*pulls, *(load.force for load in job.loads))]
     length = job.whisker.arc_length
     for normal in _normals(job, reach, turns[0], forces):
         if (

@@ -195,8 +195,7 @@ class SteppedJob:
     @cached_property
     def times(self) -> NDArray[np.float64]:
         """[s + 1] beginnings of the steps, and the end of the last (s)."""
-        count = int(np.ceil(self.where[-1])) + 2
-        return np.asarray(self.job.start + self.step * np.arange(count), dtype=np.float64)
+        return np.asarray(self.job.start + self.step * np.arange(int(np.ceil(self.where[-1])) + 2), dtype=np.float64)
 
     @cached_property
     def pose(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -168,7 +168,7 @@ def judge(facts: RunFacts) -> Verdict:
     whisker starts in or that passes through its base.
     """
     until = np.where(facts.status == OK, np.inf, facts.failed)
-    retryable = np.isin(facts.status, (BENT, LOST, GOT_INSIDE))
+    retryable = (facts.status == BENT) | (facts.status == LOST) | (facts.status == GOT_INSIDE)
     reasons = np.full(facts.status.shape, "", dtype=object)
 
     def blame(which: NDArray[np.bool_], words: Callable[[tuple[int, ...]], str]) -> None:
@@ -246,9 +246,10 @@ def start_jump(force: NDArray[np.floating], half: NDArray[np.floating]) -> NDArr
     """
     sizes = np.linalg.norm(np.stack([force, half]).astype(float), axis=-1)
     count = sizes.shape[2]
-    late = sizes[:, :, count // 2 :].max(axis=(0, 2))[None, :, None]
-    above = (sizes > 1.5 * late).any(axis=0)
     falls = (sizes[:, :, 0] >= sizes.max(axis=2)).all(axis=0)
+    if not falls.any():
+        return np.zeros(sizes.shape[1:], dtype=bool)
+    above = (sizes > 1.5 * sizes[:, :, count // 2 :].max(axis=(0, 2))[None, :, None]).any(axis=0)
     # Readings up to the last that is above.
     jump = np.logical_or.accumulate(above[:, ::-1], axis=1)[:, ::-1]
     return jump & (falls & (jump.sum(axis=1) <= count // 3))[:, None]

@@ -422,8 +422,7 @@ def object_surface(placed: PlacedObject) -> DrawnSurface:
         place = (0.0, 0.0, 0.0) if isinstance(placed.motion, (Spin, Path)) else placed.position
         meshes = [placed.solid.mesh.transformed(euler_matrix(placed.rotation), place)]
     corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])
-    normals = np.concatenate([corner_normals(mesh) for mesh in meshes])
-    return DrawnSurface(corners, normals, obstacle.motion)
+    return DrawnSurface(corners, np.concatenate([corner_normals(mesh) for mesh in meshes]), obstacle.motion)
 
 
 def part_mesh(part: Part) -> Mesh:

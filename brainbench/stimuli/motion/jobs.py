@@ -107,7 +107,8 @@ class Job:
     @cached_property
     def spacing(self) -> float:
         """Time between two frames, as a rule [s]; inf for a single one at the start."""
-        return float(np.median(np.diff(self.times, prepend=self.start))) or math.inf
+        gaps = np.sort(np.diff(self.times, prepend=self.start))
+        return float(gaps[(len(gaps) - 1) // 2] + gaps[len(gaps) // 2]) / 2 or math.inf
 
 
 @dataclass(frozen=True, eq=False)

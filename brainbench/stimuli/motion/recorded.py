@@ -225,8 +225,7 @@ def load_trajectory(path: str | os.PathLike[str], *, layout: str | None = None, 
         raise DataError(
             f"{os.fspath(path)!r} has {table.shape[1]} numbers per line; velocities come in threes (ωx, ωy, ωz)."
         )
-    names = _names(path, len(table), layout)
-    return Trajectory(names, table.reshape(len(table), -1, 3), rate)
+    return Trajectory(_names(path, len(table), layout), table.reshape(len(table), -1, 3), rate)
 
 
 def load_initial_angles(path: str | os.PathLike[str], *, layout: str | None = None) -> dict[str, Vector]:

@@ -294,8 +294,7 @@ class Path(_Motion):
         """Return how far the body has turned, rotation matrices [n, 3, 3] in world axes; times as above."""
         from scipy.spatial.transform import Rotation, RotationSpline
 
-        spline = RotationSpline(self.times, Rotation.from_euler("xyz", self.rotations))
-        return spline(self._within(times)).as_matrix()
+        return RotationSpline(self.times, Rotation.from_euler("xyz", self.rotations))(self._within(times)).as_matrix()
 
     def _within(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         times = np.asarray(times, dtype=float)

@@ -84,8 +84,7 @@ class Frames:
     def readings(self) -> NDArray[np.float64]:
         """Times [n] (s) at which the simulation is read; for a filter also before and after the frames."""
         if self.lowpass is None:
-            within = self.interval / self.average * np.arange(self.average)
-            return (self.times[:, None] + within).reshape(-1)
+            return (self.times[:, None] + self.interval / self.average * np.arange(self.average)).reshape(-1)
         steps = np.arange(-self._lead, (self.count - 1) * self.average + self._tail + 1)
         return np.maximum(self.first + self.interval / self.average * steps, 0.0)
 
@@ -308,8 +307,7 @@ class Scene:
 
     def orientations(self) -> NDArray[np.float64]:
         """Return rotations [time, whisker, 3, 3] from each whisker's base frame to the world at the frame times."""
-        times = self.frames.times
-        bases = [job.follicle.pose(times)[1] for job in self.jobs()]
+        bases = [job.follicle.pose(self.frames.times)[1] for job in self.jobs()]
         return self.axes @ base_rotation(np.stack(bases, axis=1))
 
     def config(self) -> dict[str, Any]:

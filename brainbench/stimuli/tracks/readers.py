@@ -509,8 +509,7 @@ def _read_points(path: str | os.PathLike[str], options: TrackOptions) -> tuple[N
     if "whisker" in columns:
         present = [f"{one:g}" for one in np.unique(columns["whisker"])]
         wanted = choose_name(f"whisker of {brief(os.fspath(path))}", options.track, present, how="as track")
-        chosen = columns["whisker"] == float(wanted)
-        columns = {name: values[chosen] for name, values in columns.items()}
+        columns = {name: values[columns["whisker"] == float(wanted)] for name, values in columns.items()}
     frames = frame_numbers(columns["frame"], path)
     axes = [axis for axis in ("x", "y", "z") if axis in columns]
     every, order = every_frame(frames, path), np.argsort(frames, kind="stable")

@@ -124,6 +124,7 @@ def peg(
     # Slow against the first mode, so that little swings when the peg stops.
     duration = max(0.1, 4 * settling)
     motion = sliding(lambda times: start + smooth_step(times, duration)[:, None] * (end - start))
+    vars(motion)["finest"] = 2 * duration
     rod = _peg_obstacle(whisker, peg_radius, motion)
     trace = run_one(backend, job_at_rest(whisker, np.array([duration + settling]), rod), fidelity)
     return BenchTest(trace.wrench[-1], contact.wrench, float(trace.contact_arc[-1]), trace)
@@ -323,8 +324,7 @@ def _ring_mode(
     trace = run_one(backend, Job(light, StillFollicle(), (), times, loads=loads), fine)
     assert trace.link_positions is not None
     # The mode swings about its static bend under the loads.
-    tip = trace.link_positions[:, -1, 1] - float(levers[:, -1] @ bends)
-    return fit_decay(times, tip, 1 / period, ratio)
+    return fit_decay(times, trace.link_positions[:, -1, 1] - float(levers[:, -1] @ bends), 1 / period, ratio)
 
 
 def fit_decay(times: NDArray, signal: NDArray, frequency: float, ratio: float) -> tuple[float, float]:

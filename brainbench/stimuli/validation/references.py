@@ -64,11 +64,12 @@ def point_load_deflection(whisker: Whisker, force: float, at: float) -> float:
     return force * at**3 / (3 * stiffness) * whisker.base_radius / float(whisker.radius(at))
 
 
+@lru_cache(maxsize=256)
 def natural_frequencies(whisker: Whisker, count: int = 3) -> NDArray[np.float64]:
     """Return the lowest bending frequencies [count] (Hz), base clamped, tip free, any taper and density gradient.
 
     Euler-Bernoulli finite elements (cubic Hermite, 4-point quadrature of the exact E I(s) and mass).
-    For uniform density f_n = λ_n r_b √(E/ρ)/(4π L²), with λ_n depending on r_t/r_b alone.
+    For uniform density f_n = λ_n r_b √(E/ρ)/(4π L²), with λ_n depending on r_t/r_b alone. Callers share the result.
     """
     from scipy.linalg import eigh
 
@@ -80,7 +81,9 @@ def natural_frequencies(whisker: Whisker, count: int = 3) -> NDArray[np.float64]
     # M a = ω⁻² K a: the modes wanted are the largest eigenvalues, which are resolved best.
     size = len(mass)
     inverse = eigh(mass, stiffness, eigvals_only=True, subset_by_index=[size - count, size - 1])[::-1]
-    return 1 / np.sqrt(inverse) / (2 * np.pi)
+    frequencies = 1 / np.sqrt(inverse) / (2 * np.pi)
+    frequencies.setflags(write=False)
+    return frequencies
 
 
 def beam_matrices(whisker: Whisker) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -93,17 +96,19 @@ def beam_matrices(whisker: Whisker) -> tuple[NDArray[np.float64], NDArray[np.flo
     stiffness, mass = np.zeros((size, size)), np.zeros((size, size))
     length = whisker.arc_length / _ELEMENTS
     nodes, weights = np.polynomial.legendre.leggauss(4)
+    elements = np.arange(_ELEMENTS)
     for node, weight in zip((nodes + 1) / 2, weights / 2, strict=True):
         # Cubic Hermite shape functions of deflection and slope at both ends, and their second derivatives.
         near, far = 1 - 3 * node**2 + 2 * node**3, 3 * node**2 - 2 * node**3
         shape = np.array([near, length * (node - 2 * node**2 + node**3), far, length * (node**3 - node**2)])
         bend = np.array([-6 + 12 * node, length * (-4 + 6 * node), 6 - 12 * node, length * (6 * node - 2)]) / length**2
-        s = (np.arange(_ELEMENTS) + node) * length
-        for e, (k, m) in enumerate(zip(whisker.bending_stiffness(s), whisker.linear_density(s), strict=True)):
-            block = slice(2 * e, 2 * e + 4)
-            # K = ∫ E I w″ w″ ds and M = ∫ ρ π r² w w ds of one element, summed over elements that share nodes.
-            stiffness[block, block] += weight * length * k * np.outer(bend, bend)
-            mass[block, block] += weight * length * m * np.outer(shape, shape)
+        s = (elements + node) * length
+        # K = ∫ E I w″ w″ ds and M = ∫ ρ π r² w w ds of one element, summed over elements that share nodes.
+        for matrix, law, w in ((stiffness, whisker.bending_stiffness, bend), (mass, whisker.linear_density, shape)):
+            blocks = ((weight * length * law(s))[:, None, None] * np.outer(w, w)).reshape(-1, 2, 2, 2, 2)
+            by_node = matrix.reshape(size // 2, 2, size // 2, 2)
+            for i, j in ((1, 1), (0, 1), (1, 0), (0, 0)):
+                by_node[elements + i, :, elements + j] += blocks[:, i, :, j]
     return stiffness, mass
 
 
@@ -118,8 +123,7 @@ def elastica(whisker: Whisker, at: float, offset: float, peg_radius: float | Non
     ``offset`` lies above the rest shape, else towards −y.
     """
     _check_at(whisker, at)
-    rest = whisker.curvature * at**2
-    return _Branch(whisker, at, 1 if offset >= rest else -1, peg_radius).reach(offset)
+    return _Branch(whisker, at, 1 if offset >= whisker.curvature * at**2 else -1, peg_radius).reach(offset)
 
 
 def peg_centre(whisker: Whisker, contact: Contact, peg_radius: float) -> tuple[float, float]:

@@ -140,8 +140,7 @@ class WhiskerArray:
                 "that we could read, and the released mouse scripts hold the rat's; use source='average', or the rat's "
                 "model."
             )
-        array = _published(species) if source == "average" else _modelled(species)
-        return array.on_side(side).select(whiskers)
+        return (_published if source == "average" else _modelled)(species).on_side(side).select(whiskers)
 
     @classmethod
     def mouse(cls, *, side: Side = "right", whiskers: str = "all", source: Source = "average") -> WhiskerArray:

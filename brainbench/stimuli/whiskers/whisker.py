@@ -185,8 +185,7 @@ class Whisker:
 
     def bending_stiffness(self, s: ArrayLike) -> NDArray[np.float64]:
         """Return the flexural rigidity E I [N·m²] at arc length ``s`` [m], with the second moment I = π r⁴/4."""
-        modulus = _along(self.moduli, s) if self.moduli else self.young_modulus
-        return modulus * (np.pi * self.radius(s) ** 4 / 4)
+        return (_along(self.moduli, s) if self.moduli else self.young_modulus) * (np.pi * self.radius(s) ** 4 / 4)
 
     @property
     def torsion_ratio(self) -> float:

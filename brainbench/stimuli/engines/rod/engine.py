@@ -9,7 +9,7 @@ import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
@@ -60,7 +60,6 @@ class JobTask:
     """A job that must be simulated, and what that needs."""
 
     job: Job
-    chain: Chain
     base: Track
     bodies: tuple[TrackedObstacle, ...]
     """What is in reach."""
@@ -68,13 +67,14 @@ class JobTask:
     """Which obstacles of the job these are."""
     names: tuple[int, ...]
     """Identities of their tracks, surfaces and parts: jobs with the same ones share a scene."""
-    limit: NDArray[np.float64] | None
-    """[cell] longest step from each cell of the motions on (s); None for any."""
-    approach: Approach
     twists: bool
     """Whether it may leave its plane, and may twist at this fidelity."""
+    chain: Chain
     fidelity: Fidelity
     """With what contacts touch, by what is within reach: nothing else changes a force."""
+    limit: NDArray[np.float64] | None = None
+    """[cell] longest step from each cell of the motions on (s); None for any."""
+    approach: Approach = field(default_factory=Approach)
 
     @property
     def kind(self) -> tuple[bool, ...]:
@@ -85,12 +85,22 @@ class JobTask:
         whisker, smooth = self.job.whisker, self.fidelity.contact_line == "rod"
         return self.twists, self.job.air_flow is not None, whisker.follicle is not None, bool(whisker.bends), smooth
 
+    def at(self, fidelity: Fidelity) -> JobTask:
+        """Return the task with the links and steps of a fidelity."""
+        chain = fidelity.chain(self.job.whisker)
+        step, per_period = fidelity.step_of(chain), fidelity.steps_per_period if fidelity.solver == "dynamic" else None
+        tracks = self.base, *(body.track for body in self.bodies)
+        pieces = [track.pieces for track in tracks if track.pieces is not None and track.pieces.needed.max() > 1]
+        limits = [some.longest_steps(step, per_period) for some in pieces]
+        limit = np.min(limits, axis=0) if limits else None
+        return replace(self, chain=chain, fidelity=fidelity.touching(self.bodies), limit=limit)
+
 
 def make_task(job: Job, fidelity: Fidelity, bodies: dict[Any, Any], *, silent: bool = False) -> JobTask | None:
     """Return what a job needs of its scene, None when it feels nothing, unless ``silent`` jobs are wanted too.
 
-    ``bodies`` keeps tracks of bases, and anchor and track of obstacles that move, by their ids and how they are looked
-    at, and those of what stands still by its place.
+    ``bodies`` keeps tasks of jobs, tracks of bases, and anchor and track of obstacles that move, by their ids and how
+    they are looked at, and those of what stands still by its place.
     """
     start, stop = job.start, float(job.times[-1])
     chain = fidelity.chain(job.whisker)
@@ -98,6 +108,9 @@ def make_task(job: Job, fidelity: Fidelity, bodies: dict[Any, Any], *, silent: b
     # Finer simulations of a whisker look at its motions in the same steps and cells.
     cells = max(1, math.ceil(fidelity.time_step / KNOT - 1e-9))
     cutting = Cutting(start, stop, min(step, KNOT / LOOKS), KNOT * cells)
+    met = id(job), cutting, fidelity.twist is not False
+    if met in bodies:
+        return bodies[met].at(fidelity)
     mount = id(job.follicle), job.whisker.arc_length, cutting
     if mount not in bodies:
         bodies[mount] = follicle_track(job.follicle, job.whisker.arc_length, cutting)
@@ -107,42 +120,33 @@ def make_task(job: Job, fidelity: Fidelity, bodies: dict[Any, Any], *, silent: b
     place = tuple((np.round(base.knots["place"][0] / GRID) * GRID / MILLI).tolist())
     if place not in bodies:
         bodies[place] = np.array(place), still_track(np.array(place))
-    moving = [obstacle for obstacle in job.obstacles if obstacle.motion is not None]
-    for obstacle in moving:
-        if (id(obstacle), cutting) not in bodies:
+    keys = [place if obstacle.motion is None else (id(obstacle), cutting) for obstacle in job.obstacles]
+    for key, obstacle in zip(keys, job.obstacles, strict=True):
+        if key not in bodies:
             anchor = obstacle.bounds.mean(axis=0)
-            bodies[id(obstacle), cutting] = anchor, body_track(obstacle, anchor, cutting)
+            bodies[key] = anchor, body_track(obstacle, anchor, cutting)
     # What moves is looked at wherever its motion, or that of the base, has a knot.
-    ends = np.array([start, stop])
-    seen = np.unique(
-        np.concatenate(
-            [track.times for track in (base, *(bodies[id(obstacle), cutting][1] for obstacle in moving))] + [ends]
-        )
-    )
+    tracks = base, *(bodies[key][1] for key in keys)
+    seen = np.unique(np.concatenate([[start, stop], *(track.times for track in tracks)]))
     position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(seen))
     reach = reachable(job.whisker, position, job.obstacles, seen, surfaces=True)
     if not silent and is_silent(job, reach, position, euler):
         return None
     near = tuple(
-        TrackedObstacle(obstacle, *bodies[place if obstacle.motion is None else (id(job.obstacles[which]), cutting)])
-        for which, obstacle in zip(reach.indices, reach.obstacles, strict=True)
+        TrackedObstacle(each, *bodies[keys[i]]) for i, each in zip(reach.indices, reach.obstacles, strict=True)
     )
     names = tuple(
         id(part)
         for body in near
         for part in (body.track, body.obstacle.friction, body.obstacle.surface, *body.obstacle.parts)
     )
-    per_period = fidelity.steps_per_period if fidelity.solver == "dynamic" else None
-    pieces = [track.pieces for track in (base, *(body.track for body in near)) if track.pieces is not None]
-    limits = [some.longest_steps(step, per_period) for some in pieces if some.needed.max() > 1]
-    limit = np.min(limits, axis=0) if limits else None
-    steps = np.full(len(seen) - 1, step)
-    if limit is not None:
-        steps = limit[np.clip(((seen[:-1] - start) / KNOT).astype(int), 0, len(limit) - 1)]
-    approach = _approach(job, reach, (position, euler), seen, steps, step)
     twists = fidelity.twist is not False and not stays_in_plane(job, reach, position, euler, seen)
-    fine = fidelity.touching(reach.obstacles)
-    return JobTask(job, chain, base, near, reach.indices, names, limit, approach, twists, fine)
+    task = JobTask(job, base, near, reach.indices, names, twists, chain, fidelity).at(fidelity)
+    cells = ((seen[:-1] - start) / KNOT).astype(int)
+    steps = np.full(len(cells), step) if task.limit is None else task.limit[cells.clip(0, len(task.limit) - 1)]
+    # Finer simulations have this too: none begins where an object is too fast.
+    bodies[met] = replace(task, approach=_approach(job, reach, (position, euler), seen, steps, step))
+    return bodies[met]
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,8 +213,7 @@ def _approach(
     resting, struck = None if still is None else step_travel(job.whisker, *pose, still, times), False
     for obstacle in reach.obstacles:
         moves = resting is None or obstacle.motion is not None
-        travel = step_travel(job.whisker, *pose, obstacle, times) if moves else resting
-        speed = travel / np.diff(times)
+        speed = (step_travel(job.whisker, *pose, obstacle, times) if moves else resting) / np.diff(times)
         blow = np.zeros_like(speed)
         if speed.max(initial=0.0) > BLOW:
             # Without the turns of the base, which are those of whisking. Steps that a brief motion shortens follow it.
@@ -316,8 +319,7 @@ class RodEngine(WhiskerEngine):
             else:
                 tasks.setdefault(task.kind, {})[index] = task
         for _, alike in sorted(tasks.items()):
-            spent = seconds[list(alike)]
-            traces |= _simulate(alike, spent, self.retry, pick_device(self.device), record_shape)
+            traces |= _simulate(alike, seconds[list(alike)], self.retry, pick_device(self.device), record_shape)
         return [traces[index] for index in range(len(jobs))]
 
     def prepare_sweeps(self, scenes: PassiveSweeps, fidelity: Fidelity) -> None:
@@ -398,13 +400,15 @@ def trace_of(result: LaunchResult, row: int, job: Job, fidelity: Fidelity, secon
     touching = (arc >= 0) & good
     reason = without_escape(str(result.verdict.reasons[row, 0]), job, float(result.verdict.until[row, 0]))
     shape, felt = result.points, result.contact_wrench
-    position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(job.times))
     displacement = None
     if result.displacement is not None:
         displacement = np.where(good[:, None], result.displacement[row, :, 0].astype(float), np.nan)
-        position = position + np.einsum("nij,nj->ni", base_rotation(euler), displacement[:, :3])
-    base = position[:, None]
-    nodes = fidelity.link_count(job.whisker.arc_length) + 1
+    if shape is not None:
+        position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(job.times))
+        if displacement is not None:
+            position = position + np.einsum("nij,nj->ni", base_rotation(euler), displacement[:, :3])
+        nodes = position[:, None] + shape[row, :, : fidelity.link_count(job.whisker.arc_length) + 1]
+        shape = np.where(good[:, None, None], nodes, np.nan)
     return Trace(
         wrench=np.where(good[:, None], result.wrench[row, :, 0].astype(float), np.nan),
         contact=touching,
@@ -417,6 +421,6 @@ def trace_of(result: LaunchResult, row: int, job: Job, fidelity: Fidelity, secon
         unsolved=int(result.counts["unsolved"][row, 0]),
         displacement=displacement,
         seconds=seconds,
-        link_positions=None if shape is None else np.where(good[:, None, None], base + shape[row, :, :nodes], np.nan),
+        link_positions=shape,
         contact_wrench=None if felt is None else np.where(good[:, None], felt[row], np.nan),
     )

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -181,6 +181,8 @@ class Room:
     scene: list[Any]
     problems: Any
     results: Any
+    launches: list[Any] = field(default_factory=list)
+    """The last launch, as Warp has packed it."""
 
     @cached_property
     def views(self) -> list[dict[str, NDArray]]:
@@ -194,9 +196,8 @@ class Room:
             for name, values in part.items():
                 if values.size:
                     views[name][...] = values
-        for views in self.views[len(parts) :]:
-            for view in views.values():
-                view.fill(0)
+        for view in (view for views in self.views[len(parts) :] for view in views.values()):
+            view.reshape(-1).view(np.uint8).fill(0)  # faster than record by record
 
 
 @dataclass(eq=False)
@@ -329,7 +330,7 @@ class WhiskerSolver:
         """[whisker] longest time step (ms)."""
         self.strongest = np.array([strongest_force(chain.whisker) for chain in self.chains])
         self.rooms = threading.local()
-        """Of each thread the :class:`Room` of its last launch, if that was small and on a processor."""
+        """Of each thread the :class:`Room` of its last launch, None unless that was small and on a processor."""
         self.tuning: dict[str, Any] = {}
         """Arguments of :class:`Slices`."""
         self.slices = 0
@@ -347,7 +348,12 @@ class WhiskerSolver:
         started = time.perf_counter()
         stream = self._take_steps(scene, problems, results, jobs)
         seconds = time.perf_counter() - started
-        values = download({name: getattr(results, name) for name in shapes_of}, stream)
+        room = self.rooms.last
+        if room is not None and "views" in vars(room):
+            # The next launch takes the memory.
+            values = {name: room.views[-1][name].copy() for name in shapes_of}
+        else:
+            values = download({name: getattr(results, name) for name in shapes_of}, stream)
         with lock_of(device):
             # What a GPU holds of this launch is given back under the lock too.
             del scene, problems, results
@@ -371,7 +377,7 @@ class WhiskerSolver:
             strength=strength,
             strong_at=strong_at,
             strongest=strongest,
-            **{name: np.broadcast_to(value, size) for name, value in vars(given.approach).items()},
+            **{name: np.full(size, value) for name, value in vars(given.approach).items()},
             residual=missed,
             crowded=counts["crowded"],
             steps=counts["steps"],
@@ -410,7 +416,7 @@ class WhiskerSolver:
             structs.MotionArrays: given.motions.arrays(),
             structs.ShapeArrays: given.shapes.arrays(),
             structs.JobArrays: jobs.arrays(self.chains, steps, given.start),
-            structs.ReadingArrays: _readings(given.readings - given.start),
+            structs.ReadingArrays: _readings((given.readings - given.start).tobytes()),
         }
         shapes_of = {
             "state": (count,),
@@ -421,7 +427,7 @@ class WhiskerSolver:
         }
         if self.yields:
             shapes_of["displacement"] = shapes_of["wrench"]
-        shapes = [*shapes_of.values(), *(np.shape(values) for part in parts.values() for values in part.values())]
+        shapes = [*shapes_of.values(), *(values.shape for part in parts.values() for values in part.values())]
         room = getattr(self.rooms, "last", None)
         with lock_of(device):
             if room is None or room.shapes != shapes:
@@ -432,13 +438,11 @@ class WhiskerSolver:
                     make_problems(self.kernels, self.capacity, count, device, self.iterations),
                     allocate(structs.ResultArrays, device, **shapes_of),
                 )
-                if small:
-                    self.rooms.last = room
+                self.rooms.last = room if small else None
             else:
                 room.refill(parts)
             room.results.contact.fill_(-1.0)
-        scene = SceneParts._make((self.chain_arrays, *room.scene, options))
-        return scene, room.problems, room.results, shapes_of
+        return SceneParts(self.chain_arrays, *room.scene, options), room.problems, room.results, shapes_of
 
     def _take_steps(self, scene: SceneParts, problems: Any, results: Any, jobs: PackedJobs) -> Any:
         """Take all whiskers to their last reading; return the stream in which that is done, None of a processor."""
@@ -451,8 +455,14 @@ class WhiskerSolver:
             self.slices = slices.run(scene, problems, results, self.block["block_dim"])
             return slices.stream
         with lock_of(device):
-            inputs = [*scene, problems, self.kernels.structs.PausedWhiskers(), results]
-            wp.launch(self.kernels.run, count, inputs, device=device, **self.block)
+            launches = [] if self.rooms.last is None else self.rooms.last.launches
+            if launches:
+                launches[0].set_param_at_index(SceneParts._fields.index("options"), scene.options)
+            else:
+                inputs = [*scene, problems, self.kernels.structs.PausedWhiskers(), results]
+                options = {"device": device, "record_cmd": True, **self.block}
+                launches.append(wp.launch(self.kernels.run, count, inputs, **options))
+            launches[0].launch()
             wp.synchronize_device(device)
         return None
 
@@ -462,9 +472,10 @@ def real_type(fidelity: Fidelity) -> type:
     return warp().float32 if fidelity.precision == "single" else warp().float64
 
 
-def _readings(times: NDArray[np.float64]) -> dict[str, NDArray]:
-    """Return what the kernel's ``ReadingArrays`` hold, for times (s) since the start."""
-    times = times * MILLI
+@lru_cache(16)
+def _readings(moments: bytes) -> dict[str, NDArray]:
+    """Return what the kernel's ``ReadingArrays`` hold, for times (s) since the start, which most launches share."""
+    times = np.frombuffer(moments) * MILLI
     before = np.concatenate([[0.0], times[:-1]])
     # Within a span single precision keeps time; longer ones are divided, in equal parts.
     parts = np.maximum(np.ceil((times - before) / LONGEST_SPAN - 1e-9), 1).astype(int)

@@ -146,8 +146,7 @@ def knots_alike(
 ) -> NDArray[np.void]:
     """Return the knots [knot] of another pose, where a track that begins and ends at ``span`` (s) has its own."""
     if track.pieces is None:
-        seen = np.linspace(*span, 17)
-        place, rotation = pose(seen)
+        place, rotation = pose(np.linspace(*span, 17))
         place, rotation = np.asarray(place, dtype=float), to_matrices(np.asarray(rotation, dtype=float))
         if max(np.ptp(place, axis=0).max(), np.ptp(rotation, axis=0).max()) > 1e-12:
             raise UsageError(
@@ -524,12 +523,8 @@ class PackedShapes:
         match solid:
             case Sphere():
                 radius = solid.radius * MILLI
-                return row | {
-                    "kind": limits.SPHERE,
-                    "size": np.full(3, radius),
-                    "place": _mm(solid.centre),
-                    "radius": radius,
-                }
+                sphere = {"kind": limits.SPHERE, "size": np.full(3, radius), "place": _mm(solid.centre)}
+                return row | sphere | {"radius": radius}
             case Box():
                 box = {"kind": limits.BOX, "size": _mm(solid.half_sizes), "place": _mm(solid.centre)}
                 return row | box | {"quaternion": np.array(solid.quaternion), "radius": math.hypot(*box["size"])}
@@ -591,8 +586,7 @@ def pseudo_normals(vertices: NDArray[np.float64], faces: NDArray[np.integer]) ->
     corners = vertices[faces]
     # Each edge gets one number from its two corners: both faces at it add to the same sum.
     edges = np.sort(np.stack([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]], axis=1), axis=2)
-    names = edges[..., 0].astype(np.int64) * len(vertices) + edges[..., 1]
-    _, which = np.unique(names, return_inverse=True)
+    _, which = np.unique(edges[..., 0].astype(np.int64) * len(vertices) + edges[..., 1], return_inverse=True)
     which = which.reshape(-1, 3)
     at_corner, across = _face_normals(corners, which)
     at_vertex = np.zeros_like(vertices)
@@ -603,8 +597,7 @@ def pseudo_normals(vertices: NDArray[np.float64], faces: NDArray[np.integer]) ->
         angle = np.arctan2(np.linalg.norm(np.cross(to_next, to_last), axis=1), np.sum(to_next * to_last, axis=1))
         for axis in range(3):
             at_vertex[:, axis] += np.bincount(faces[:, k], at_corner[:, axis] * angle, len(vertices))
-    spread = across.reshape(-1, 3)
-    at_edge = np.stack([np.bincount(which.ravel(), spread[:, axis]) for axis in range(3)], axis=1)
+    at_edge = np.stack([np.bincount(which.ravel(), across[..., axis].ravel()) for axis in range(3)], axis=1)
     outward = np.concatenate([at_corner[:, None], at_vertex[faces], at_edge[which]], axis=1)
     length = np.linalg.norm(outward, axis=2, keepdims=True)
     return outward / np.where(length > 0, length, 1.0)

@@ -87,8 +87,7 @@ def goblet(draw: ShapeSampler, detail: int) -> Body:
     (split,) = draw(stem_share=(0.45, 0.58))
     bottom = np.array([[foot, 0.0], [foot, 0.04], [0.4 * foot, 0.09], [stem, 0.16], [stem, split - 0.05]])
     cup_line = _outline([split, split + 0.15, 1.0, 1.15], [0.1, 0.9 * cup_radius, cup_radius, 0.92 * cup_radius], 12)
-    line = np.vstack([bottom, cup_line])
-    return lathe(line, around(detail), wall=0.045, floor=cup_line[1, 1])
+    return lathe(np.vstack([bottom, cup_line]), around(detail), wall=0.045, floor=cup_line[1, 1])
 
 
 def spool(draw: ShapeSampler, detail: int) -> Body:
@@ -132,8 +131,7 @@ def top(draw: ShapeSampler, detail: int) -> Body:
     rim, depth, pin, length = draw(rim=(0.34, 0.58), depth=(0.3, 0.65), pin=(0.04, 0.08), pin_length=(0.25, 0.4))
     (shoulder,) = draw(shoulder=(0.08, 0.2))
     z = [0, depth, depth + 0.06, depth + 0.06 + shoulder, depth + 0.06 + shoulder + length]
-    points = list(zip([0.0, rim, rim, 1.4 * pin, pin], z, strict=True))
-    return lathe(np.array(points), around(detail))
+    return lathe(np.column_stack([[0.0, rim, rim, 1.4 * pin, pin], z]), around(detail))
 
 
 def bell(draw: ShapeSampler, detail: int) -> Body:
@@ -413,8 +411,7 @@ def horn(draw: ShapeSampler, detail: int) -> Body:
     sides, steps = _mesh_of(detail)
     t = np.linspace(0, 1, steps)
     angle = turn * np.pi * t
-    path = np.column_stack([np.cos(angle), np.sin(angle), rise * t])
-    return tube(path, base * (1 - t) + 0.03, sides, closed=False)
+    return tube(np.column_stack([np.cos(angle), np.sin(angle), rise * t]), base * (1 - t) + 0.03, sides, closed=False)
 
 
 def dumbbell(draw: ShapeSampler, detail: int) -> Body:
