@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import h5py
@@ -39,6 +41,11 @@ def test_a_hundred_and_ten_frames_become_twenty_two_steps_of_thirty_channels():
     grid = to_grid(dataset)
     assert grid.shape == (2, 22, 30, 5, 7)
     assert grid.dtype == np.float32
+
+
+def test_a_new_set_loads_no_dask():
+    code = "import sys; from tests.stimuli import test_stimulus_set as sets; sets._dataset('C2', count=5)\n"
+    subprocess.run([sys.executable, "-c", code + "assert 'dask.array' not in sys.modules"], check=True)
 
 
 def test_a_written_set_keeps_texts_with_letters_of_any_language(tmp_path: Path):

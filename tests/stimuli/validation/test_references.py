@@ -73,6 +73,10 @@ def test_natural_frequencies_of_tapers_match_the_table(ratio, expected):
     np.testing.assert_allclose(references.natural_frequencies(whisker) / scale, expected, rtol=5e-5)
 
 
+def test_natural_frequencies_are_found_once_for_a_whisker():
+    assert references.natural_frequencies(C2, 1) is references.natural_frequencies(replace(C2), 1)
+
+
 def test_natural_frequencies_with_a_density_gradient_match_the_table():
     np.testing.assert_allclose(references.natural_frequencies(C2), (186.48, 546.15, 1175.4), rtol=4e-5)
     np.testing.assert_allclose(references.natural_frequencies(H), (108.87, 282.27, 560.97), rtol=4e-5)

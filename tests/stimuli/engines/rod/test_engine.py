@@ -80,6 +80,13 @@ def test_a_run_takes_the_memory_of_the_last_one_and_leaves_its_results_as_they_w
     assert results[0].wrench.tobytes() == results[2].wrench.tobytes() != results[1].wrench.tobytes()
 
 
+def test_a_recorded_launch_takes_the_gravity_of_its_own_job():
+    jobs = [Job(C2, StillFollicle(), (), np.array([0.01]), gravity=(0.0, pull, 0.0)) for pull in (-9.81, 9.81, -9.81)]
+    down, up, again = (_run(job)[0].wrench for job in jobs)
+    assert down[0, 1] < 0 < up[0, 1]
+    assert down.tobytes() == again.tobytes()
+
+
 @pytest.mark.parametrize("kind", ["peg", "knife"])
 def test_nothing_thin_passes_through_a_whisker_in_steps_of_a_millisecond(kind):
     """60 mm/s in steps of 1 ms: each step is longer than the peg is thick, and sixty times the knife's edge."""
