@@ -442,7 +442,7 @@ class WhiskerSolver:
             else:
                 room.refill(parts)
             room.results.contact.fill_(-1.0)
-        return SceneParts(self.chain_arrays, *room.scene, options), room.problems, room.results, shapes_of
+        return SceneParts._make((self.chain_arrays, *room.scene, options)), room.problems, room.results, shapes_of
 
     def _take_steps(self, scene: SceneParts, problems: Any, results: Any, jobs: PackedJobs) -> Any:
         """Take all whiskers to their last reading; return the stream in which that is done, None of a processor."""
