@@ -292,13 +292,11 @@ def _scatter(axes: FingerAxes, link: str, probes: Probes, observe: str) -> NDArr
     turn, origin = axes.place[link]
     rows, columns = axes.sites(link, points)
     wrench = _WRENCHES[observe](points, normals)
+    # F = R f and M = R m + (x₀ − x_site) × F: the wrench about the link's origin moved to the middle of its site.
+    force, lever = turn @ wrench[:, :3], origin - axes.centers[rows, columns]
+    moment = turn @ wrench[:, 3:] + np.cross(lever[:, :, None], force, axis=1)
     part = np.zeros((SITES, 6, len(points), wrench.shape[2]))
-    for index, (row, column) in enumerate(zip(rows, columns, strict=True)):
-        # F = R f and M = R m + (x₀ − x_site) × F: the wrench about the link's origin moved to the middle of its site.
-        force = turn @ wrench[index, :3]
-        lever = origin - axes.centers[row, column]
-        moment = turn @ wrench[index, 3:] + np.cross(lever[:, None], force, axis=0)
-        part[row * GRID_SHAPE[1] + column, :, index] = np.concatenate([force, moment])
+    part[rows * GRID_SHAPE[1] + columns, :, np.arange(len(points))] = np.concatenate([force, moment], axis=1)
     return part
 
 
