@@ -401,9 +401,11 @@ class Trainer:
                 f"{brief(str(file))} holds no {missing[0]}, and a run begins with actor and critic of another: give a "
                 "folder of brainbench policy train, one of its model_<iteration>.safetensors, or a shipped teacher."
             )
-        for name, tree in parts.items():
-            what = f"the {name} here, whose observations, actions or layers are not those of {brief(str(file))}"
-            load_named(state[f"{name}_state_dict"], tree, what=what)
+        with readable(file, "teacher", "It is damaged, or of another policy."):
+            for name, tree in parts.items():
+                check_finite(tree, str(file))
+                what = f"the {name} here, whose observations, actions or layers are not those of {brief(str(file))}"
+                load_named(state[f"{name}_state_dict"], tree, what=what)
         if std is not None:
             spread: Any = self.algorithm.get_policy().distribution
             log = spread.std_type == "log"
