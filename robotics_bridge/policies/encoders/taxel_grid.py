@@ -344,7 +344,7 @@ class TaxelGraph(nn.Module):
         values, patterns = zip(*map(_patterns, points), strict=True)
         # Stable: patterns that are equally smooth keep the order of the links.
         smoothest = np.argsort(np.concatenate(values), kind="stable")[:SITES]
-        rows = block_diag(*(np.sqrt(len(each)) * each for each in patterns))[smoothest]
+        rows = np.asarray(block_diag(*(np.sqrt(len(each)) * each for each in patterns)))[smoothest]
         middle = np.concatenate([np.tile(one.mean(0), (len(one), 1)) for one in points if len(one)])
         # Not weights: they follow from the layout, so files of weights need not hold them.
         self.cells: int = len(rows)
