@@ -105,12 +105,13 @@ def lock_folder(folder: Path, *, wait: bool = True) -> Iterator[bool]:
     """Hold a lock on a folder, which the system releases when this process ends in whatever way.
 
     Args:
-        folder: made if it is missing.
+        folder: made if it is missing; one that was made for nothing, since no file came into it, goes again.
         wait: for another process that holds it, rather than refuse.
 
     Yields:
         False where there are no such locks (Windows; some network file systems, which are warned of).
     """
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     if fcntl is None:
         yield False
@@ -125,6 +126,11 @@ def lock_folder(folder: Path, *, wait: bool = True) -> Iterator[bool]:
         except OSError as error:
             _LOG.warning("%s cannot be locked (%s); start no second run there", folder, error)
         yield held
+    except BaseException:
+        with contextlib.suppress(OSError):  # others may write there by now
+            for path in missing if held else ():
+                path.rmdir()
+        raise
     finally:
         os.close(handle)
 

@@ -158,19 +158,38 @@ def _cells(group: h5py.Group) -> dict[str, Any]:
     columns: dict[str, Any] = {}
     try:
         plane: Any = group.file[rois.attrs["table"]]
-        rows = np.asarray(rois[...], dtype=np.int64).ravel()
+        rows = np.asarray(rois[...], dtype=np.float64).ravel()
         data: Any = group["data"]
+        number = data.shape[1] if data.ndim > 1 else 1
+        if len(rows) != number:
+            rows = np.full(number, np.nan)
         if "location" in plane:
-            columns["area"] = decode(plane["location"][...])[rows]
+            columns["area"] = _looked_up(decode(plane["location"][...]), rows, "")
         if "iscell" in plane:
-            # Suite2p keeps the probability beside it.
-            flags = np.asarray(plane["iscell"][...], dtype=np.float64)
-            columns["iscell"] = flags.reshape(len(flags), -1)[rows, 0]
+            columns["iscell"] = _looked_up(_flags(plane["iscell"]), rows, np.nan)
         if "imaging_plane/location" in plane:
             columns["area"] = np.full(len(rows), _string(plane, "imaging_plane/location"))
     except (AttributeError, KeyError, ValueError, TypeError, IndexError):  # without a plane every column is a cell
         return {}
-    return columns if len(rows) == (data.shape[1] if data.ndim > 1 else 1) else {}
+    return columns
+
+
+def _looked_up(values: np.ndarray, rows: np.ndarray, missing: Any) -> np.ndarray:
+    """Return the values at rows, and what is missing for rows that the table does not have."""
+    inside = np.isin(rows, np.arange(len(values)))
+    result = np.full(len(rows), missing, dtype=values.dtype)
+    result[inside] = values[rows[inside].astype(np.int64)]
+    return result
+
+
+def _flags(column: Any) -> np.ndarray:
+    """Return which rows of a plane are cells; of no rows, where these are no numbers."""
+    try:
+        flags = np.asarray(column[...], dtype=np.float64)
+    except (AttributeError, TypeError, ValueError):
+        return np.zeros(0)
+    # Suite2p keeps the probability beside it.
+    return flags[:, 0] if flags.ndim > 1 else flags
 
 
 def _is_table(place: str, group: Any) -> bool:

@@ -90,6 +90,15 @@ class _Config:
     values: tuple[float, ...]
 
 
+def test_a_folder_that_was_made_for_a_lock_goes_with_an_error_while_it_is_empty(tmp_path):
+    (tmp_path / "before").mkdir()
+    for folder, stays in ((tmp_path / "a" / "b", False), (tmp_path / "before", True)):
+        with pytest.raises(FileNotFoundError), lock_folder(folder):
+            (folder / "none").unlink()
+        assert folder.exists() == stays
+    assert not (tmp_path / "a").exists()
+
+
 def test_a_failed_write_leaves_the_old_file_and_no_rubbish(tmp_path: Path):
     target = tmp_path / "result.json"
     files.write_json(target, {"old": 1})

@@ -117,7 +117,9 @@ class Samples:
     def rule_out(self, keep: NDArray[np.bool_], selection: Selection, ledger: Ledger) -> NDArray[np.bool_]:
         """Return which units [U] remain without what the file calls no cell."""
         if "iscell" in self.units:
-            keep = ledger.apply(keep, self.units.times("iscell") > 0, "units", "no cell (iscell)")
+            flags = self.units.times("iscell")
+            keep = ledger.apply(keep, np.isfinite(flags), "units", "not known whether a cell (no row has its iscell)")
+            keep = ledger.apply(keep, flags > 0, "units", "no cell (iscell)")
         return keep
 
     def covered(self, edges: Floats, ledger: Ledger) -> NDArray[np.bool_]:

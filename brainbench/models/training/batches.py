@@ -17,11 +17,11 @@ Axes are those of the stimuli: x to the right, y rostral, z dorsal; rows A–E r
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol, runtime_checkable
 
 import torch
 from torch import nn
@@ -29,7 +29,7 @@ from torch.nn import functional
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
 from brainbench.core.devices import torch_device
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import DataError, UsageError, check_name
 from brainbench.core.limits import Limit, limited
 from brainbench.models.network import Normaliser
 
@@ -242,6 +242,7 @@ class Batches(Protocol):
         ...
 
 
+@runtime_checkable
 class Data(Protocol):
     """A labelled data set with splits, as training needs it."""
 
@@ -254,6 +255,50 @@ class Data(Protocol):
     def batches(self, split: str, options: BatchOptions) -> Batches | None:
         """Return the batches of ``train``, ``validation`` or ``test``; None if there is no such split."""
         ...
+
+
+@dataclass
+class CheckedBatches:
+    """Batches of others, of which every batch is checked before a network meets it."""
+
+    batches: Batches
+    split: str
+    classes: int
+
+    def __iter__(self) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+        for batch in self.batches:
+            yield self.checked(batch)
+
+    def __len__(self) -> int:
+        return len(self.batches)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return where the iteration stands."""
+        return self.batches.state_dict()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on where ``state`` was taken."""
+        self.batches.load_state_dict(state)
+
+    def checked(self, batch: Any) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the sweeps [B, ...] of a batch, those in double precision rounded to single, and its labels [B]."""
+        pair = tuple(batch) if isinstance(batch, Sequence) else (batch,)
+        if len(pair) != 2 or not all(isinstance(part, torch.Tensor) for part in pair):
+            kinds = ", ".join(type(part).__name__ for part in pair[:4])
+            raise self._error(f"is (sweeps, labels), two tensors; received {kinds}")
+        x, labels = pair
+        if not x.is_floating_point() or labels.is_floating_point() or labels.is_complex():
+            raise self._error(f"has real sweeps and whole numbers as labels; received {x.dtype} and {labels.dtype}")
+        if not len(x) or labels.shape != x.shape[:1]:
+            raise self._error(f"has a label for each sweep; received shapes {[*x.shape]} and {[*labels.shape]}")
+        low, high = (int(end) for end in labels.aminmax())
+        if low < 0 or high >= self.classes:
+            wrong = low if low < 0 else high
+            raise self._error(f"has labels from 0 to {self.classes - 1}, one for each class; received {wrong}")
+        return x.float() if x.dtype == torch.float64 else x, labels.long()
+
+    def _error(self, text: str) -> DataError:
+        return DataError(f"A batch of the split {self.split!r} {text}.")
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,16 @@ from brainbench.core.runs.log import RunLog, read_log
 from brainbench.models.activations import evaluating
 from brainbench.models.ops.layers import seeded
 from brainbench.models.registry import load_model
-from brainbench.models.training.batches import MOUSE, Augmentation, Batches, BatchOptions, Data, Processes, processes
+from brainbench.models.training.batches import (
+    MOUSE,
+    Augmentation,
+    Batches,
+    BatchOptions,
+    CheckedBatches,
+    Data,
+    Processes,
+    processes,
+)
 from brainbench.models.training.checkpoints import WEIGHTS, load_weights, save_checkpoint
 from brainbench.models.training.config import TrainingConfig, check_start, config_warnings
 from brainbench.models.training.evaluation import (
@@ -101,6 +110,10 @@ def train(
         How it ended. A loss or gradient that is not finite ends it as ``diverged``: the last good state and model
         stay, and the batch is kept in ``failed-batch.safetensors``.
     """
+    if not isinstance(data, Data):
+        raise UsageError(
+            f"Data for training have classes, a summary and batches(split, options); received {type(data).__name__}."
+        )
     stop = folder.Stop(stop_after)
     with processes(device) as where, folder.occupied(Path(out), stop, lock=where.first), seeded(config.seed):
         run = _Run(config, data, Path(out), where, progress, Path(controls or out) / CONTROLS_FILE)
@@ -159,6 +172,7 @@ class _Run:
         if batches is None:
             raise DataError("The data set has no split 'train', so there is nothing to train on.")
         self.batches: Batches = batches
+        self._try_batches()
         # What cannot be trained has ended by now, and takes no folder.
         self._claim(write=where.first)
         where.wait()
@@ -169,6 +183,14 @@ class _Run:
         self.log = RunLog(out, "step", self.at.step, active=where.first)
         for warning in config_warnings(config, self.model) if where.first else ():
             _log.warning("%s", warning)
+
+    def _try_batches(self) -> None:
+        """Show the network two sweeps of each split, which it refuses where it cannot read them."""
+        for split in ("train", "validation", "test"):
+            for x, _ in self._batches(split, shuffle=False) or ():
+                with evaluating(self.model), torch.no_grad(), self._precision():
+                    self.model(x[:2].to(self.where.device))
+                break
 
     def _claim(self, *, write: bool) -> None:
         identity = {**self.config.identity, "classes": list(self.data.classes)}
@@ -441,7 +463,8 @@ class _Run:
     def _batches(self, split: str, *, shuffle: bool, part: bool = True) -> Batches | None:
         mine = self.where.part if part else (0, 1)
         options = BatchOptions(self.config.batch_size, shuffle, self.config.seed, mine, self.where.device)
-        return self.data.batches(split, options)
+        batches = self.data.batches(split, options)
+        return None if batches is None else CheckedBatches(batches, split, len(self.data.classes))
 
     def _precision(self) -> Any:
         if self.config.precision == "float32":

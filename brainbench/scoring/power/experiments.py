@@ -13,6 +13,10 @@ A score states the reliability r of whole RDMs. Their mean distance is reliable 
 K − 1 contrasts of Gaussian patterns it has h = (nD + 2)/((n − 1)(n + 2)) times the whitened square of the differences,
 from the same moments as the dimensions below, so q = r/(r + (1 + h)(1 − r)).
 
+A score, a consistency and a reliability are means over experiments of what a few stimuli show. There the comparison of
+x · a + √(1 − x²) · b with a is below x on average, by 8 % with five stimuli. The weights above are therefore those
+whose mean comparison is √c, √q and e/√c; sums whose other terms are independent multiply these means.
+
 Each experiment goes through the permutation test of a score, with the
 choice among ``layers`` of which one has the effect and the others know nothing. The comparison is the whitened one
 with the mean distance taken away, which has the same permutations as the whitened cosine and a chance of 0.
@@ -29,6 +33,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from itertools import combinations
 from typing import Annotated
 
@@ -44,7 +49,7 @@ from brainbench.metrics.arrays import Floats, Ints
 from brainbench.metrics.evaluation import held_out
 from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, label_orders, smallest_p, tail_p
 from brainbench.metrics.measures.rsa import RSA
-from brainbench.metrics.rdms.comparison import features, upper
+from brainbench.metrics.rdms.comparison import LINEAR, features, upper
 
 MOST = 100.0  # largest number of dimensions that is told apart from more
 _SPLITS = 20
@@ -148,6 +153,7 @@ _COMPARISON = "whitened-pearson"
 _ORDERS = 999  # random orders of simulated tests at levels from .01 on; below, as many as a score takes
 _EXACT_STIMULI = 6  # up to this many stimuli all orders are taken
 _CHUNK_ELEMENTS = 1 << 21
+_PAIRS, _WEIGHTS = 4000, 101  # pairs of RDMs, and weights of their sums, whose mean comparison is looked up
 
 
 @limited
@@ -183,6 +189,8 @@ class ExperimentDesign:
     def reliability_of_differences(self) -> float:
         """Reliability of an animal's RDM without its mean distance, on which a comparison with a chance of 0 rests."""
         contrasts = self.stimuli - 1
+        if contrasts < 2:  # a single distance differs from none
+            return 0.0
         mean = (contrasts * self.dimensions + 2) / ((contrasts - 1) * (contrasts + 2))
         return self.reliability / (self.reliability + (1 + mean) * (1 - self.reliability))
 
@@ -248,24 +256,45 @@ def needed(
 
 def simulate_experiments(generator: np.random.Generator, design: ExperimentDesign, size: int) -> tuple[Floats, Floats]:
     """Return models [S, L, P] and measured animals [S, A, P]."""
-
-    def rdms(*shape: int) -> Floats:
-        """Draw RDMs [..., P] of random patterns, scaled to mean 0 and variance 1."""
-        patterns = generator.standard_normal((*shape, design.stimuli, design.dimensions))
-        products = patterns @ patterns.swapaxes(-1, -2)
-        squares = np.einsum("...kk->...k", products)
-        distances = upper(squares[..., None] + squares[..., None, :] - 2 * products)
-        # Squared distances of Gaussian patterns have mean 2D and variance 8D.
-        return (distances - 2 * design.dimensions) / math.sqrt(8 * design.dimensions)
-
+    rdms = partial(_rdms, generator, design.stimuli, design.dimensions)
     c, q = design.consistency, design.reliability_of_differences
-    # The three equations of the module's text; weights x and √(1 − x²) keep every RDM at unit variance.
-    weight = design.effect / math.sqrt(c) if c else 0.0
+
+    def mixed(comparison: float, rdm: Floats, rest: Floats) -> Floats:
+        # The weights x and √(1 − x²) keep every RDM at unit variance.
+        weight = _weight(min(abs(comparison), 1.0), design.stimuli, design.dimensions)
+        return math.copysign(weight, comparison) * rdm + math.sqrt(1 - weight**2) * rest
+
+    # The three equations of the module's text.
     shared = rdms(size, 1)
     model = rdms(size, design.layers)
-    model[:, :1] = weight * shared + math.sqrt(max(0.0, 1 - weight**2)) * model[:, :1]
-    animals = math.sqrt(c) * shared + math.sqrt(1 - c) * rdms(size, design.animals)
-    return model, math.sqrt(q) * animals + math.sqrt(1 - q) * rdms(size, design.animals)
+    model[:, :1] = mixed(design.effect / math.sqrt(c) if c else 0.0, shared, model[:, :1])
+    animals = mixed(math.sqrt(c), shared, rdms(size, design.animals))
+    return model, mixed(math.sqrt(q), animals, rdms(size, design.animals))
+
+
+def _rdms(generator: np.random.Generator, stimuli: int, dimensions: int, *shape: int) -> Floats:
+    """Return standardised squared distances [*shape, P] of Gaussian patterns."""
+    patterns = generator.standard_normal((*shape, stimuli, dimensions))
+    products = patterns @ patterns.swapaxes(-1, -2)
+    squares = np.einsum("...kk->...k", products)
+    distances = upper(squares[..., None] + squares[..., None, :] - 2 * products)
+    # Squared distances of Gaussian patterns have mean 2D and variance 8D.
+    return (distances - 2 * dimensions) / math.sqrt(8 * dimensions)
+
+
+@lru_cache(maxsize=256)
+def _weight(comparison: float, stimuli: int, dimensions: int) -> float:
+    """Return x for which x · a + √(1 − x²) · b and a have this mean comparison, for independent RDMs a and b."""
+    if stimuli < 3:  # a single distance is compared with nothing
+        return comparison
+    a, b = LINEAR[_COMPARISON](_rdms(np.random.default_rng(0), stimuli, dimensions, 2, _PAIRS))
+    aa, bb, ab = (a * a).sum(axis=-1), (b * b).sum(axis=-1), (a * b).sum(axis=-1)
+    # Both signs of what a pair shares by luck, so that the mean of unrelated RDMs is exactly 0.
+    aa, bb, ab = np.tile(aa, 2), np.tile(bb, 2), np.concatenate([ab, -ab])
+    x = np.linspace(0, 1, _WEIGHTS)[:, None]
+    rest = np.sqrt(1 - x**2)
+    comparisons = (x * aa + rest * ab) / np.sqrt(aa * (x**2 * aa + 2 * x * rest * ab + rest**2 * bb))
+    return float(np.interp(comparison, comparisons.mean(axis=1), x[:, 0]))
 
 
 def _statistics(model: Floats, brain: Floats, places: Ints) -> Floats:

@@ -177,6 +177,33 @@ def test_what_is_no_cell_is_left_out_and_cells_have_the_area_of_their_plane(tmp_
     np.testing.assert_allclose(values[0, 0], data[:5, 1:].mean(axis=0), rtol=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("rois", "flags", "units"),
+    [
+        ([3, 1, 0], [1, 1, 0], ["1", "2"]),
+        ([-1, 1, 0], [1, 1, 1], ["1", "2"]),
+        ([0.5, 1, 2], [1, 1, 1], ["1", "2"]),
+        ([2, 1, 0], [1, 1], ["1", "2"]),
+    ],
+)
+def test_cells_without_a_row_in_the_table_of_their_plane_are_left_out_and_counted(tmp_path, rois, flags, units):
+    path = segmented(imaged(tmp_path / "a.nwb", np.random.default_rng(0).normal(size=(70, 3))), flags)
+    with h5py.File(path, "a") as file:
+        table = file[SERIES]["rois"].attrs["table"]
+        del file[SERIES]["rois"]
+        file[SERIES].create_dataset("rois", data=np.array(rois)).attrs["table"] = table
+    opened, _ = means(path)
+    assert opened["unit_id"].values.tolist() == units
+    assert opened.attrs["removed"]["units: not known whether a cell (no row has its iscell)"] == 1
+
+
+@pytest.mark.parametrize("flags", [[b"yes", b"no", b"yes"], []])
+def test_where_no_column_is_known_to_be_a_cell_none_is_scored(tmp_path, flags):
+    path = segmented(imaged(tmp_path / "a.nwb", np.random.default_rng(0).normal(size=(70, 3))), flags)
+    with pytest.raises(DataError, match=r"not known whether a cell .* removed 3"):
+        means(path)
+
+
 def test_responses_that_fade_over_the_session_are_doubted():
     random = np.random.default_rng(0)
     steady = random.normal(size=(40, 1, 20)).astype(np.float32)

@@ -476,3 +476,54 @@ def test_a_run_of_a_layer_normalised_network_on_late_touch_trains(tmp_path):
     config = _config(model="zhuang-intersection-ln-small", epochs=1, batch_size=4)
     result = train(config, data, out=tmp_path, device="cpu")
     assert result.status == "finished", result.reason
+
+
+class _Changed:
+    """The sweeps of ``tiny``, each batch changed."""
+
+    classes, summary = CLASSES, {}
+
+    def __init__(self, change):
+        self.change = change
+
+    def batches(self, split, options):
+        batches = tiny().batches(split, options)
+        original = batches.__iter__
+        changed = type("Changed", (type(batches),), {"__iter__": lambda _: (self.change(*pair) for pair in original())})
+        batches.__class__ = changed
+        return batches
+
+
+@pytest.mark.parametrize("objective", ["supervised", "simclr"])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda x, y: (x, y + 1), "labels from 0 to 2, one for each class; received 3"),
+        (lambda x, y: (x, y - 1), "labels from 0 to 2, one for each class; received -1"),
+        (lambda x, y: (x, y.float()), r"whole numbers as labels; received torch.float32 and torch.float32"),
+        (lambda x, y: (x.int(), y), r"real sweeps and whole numbers as labels; received torch.int32"),
+        (lambda x, y: (x, y[:-1]), r"a label for each sweep; received shapes .* and \[7\]"),
+        (lambda x, y: (x, y[:, None]), r"a label for each sweep; received shapes .* and \[8, 1\]"),
+        (lambda x, y: (x[:0], y[:0]), r"a label for each sweep; received shapes \[0, "),
+        (lambda x, y: (x.numpy(), y), "two tensors; received ndarray, Tensor"),
+        (lambda x, y: x, "two tensors; received Tensor"),
+        (lambda x, y: (x[:, 0], y), r"expects \[batch, time, 30, 5, 7\]"),
+        (lambda x, y: (x * float("nan"), y), "not finite"),
+    ],
+)
+def test_data_that_cannot_be_trained_on_end_in_a_sentence_and_leave_no_folder(tmp_path, objective, change, message):
+    with pytest.raises((DataError, UsageError), match=message):
+        train(_config(objective, augmentation="physical"), _Changed(change), out=tmp_path / "a" / "run", device="cpu")
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_is_no_data_set_is_named(tmp_path):
+    with pytest.raises(UsageError, match=r"classes, a summary and batches.*received list"):
+        train(_config(), [1, 2], out=tmp_path / "run", device="cpu")
+
+
+def test_sweeps_in_double_precision_and_short_labels_train_as_others(tmp_path):
+    changed = _Changed(lambda x, y: (x.double(), y.to(torch.int16)))
+    train(_config(), changed, out=tmp_path / "changed", device="cpu")
+    train(_config(), tiny(), out=tmp_path / "plain", device="cpu")
+    assert _equal(_weights(tmp_path / "changed"), _weights(tmp_path / "plain"))
