@@ -7,7 +7,7 @@ from typing import Any
 from brainbench.cli.output import Output, table
 from brainbench.core.devices import usable_processors
 from brainbench.core.errors import BrainbenchError, install_command
-from brainbench.core.files import CACHE_VARIABLE, cache_dir, check_folder, provenance
+from brainbench.core.files import CACHE_VARIABLE, cache_dir, check_folder, provenance, user_folder
 
 ENABLES = {
     "nwb": "checks of NWB files against the schema and best practice",
@@ -51,8 +51,9 @@ def diagnose() -> dict[str, Any]:
 
     cache, problem, facts = None, None, provenance()
     try:
+        root = user_folder(CACHE_VARIABLE, "user_cache_dir")
         cache = cache_dir()
-        check_folder(cache, CACHE_VARIABLE)
+        check_folder(root, CACHE_VARIABLE)
     except BrainbenchError as error:  # what is wrong here is what one wants to read
         problem = str(error)
     return {

@@ -32,7 +32,7 @@ from brainbench.cli.output import Output, show
 from brainbench.core import limits
 from brainbench.core.errors import UsageError, brief, check_name, missing_dependency
 from brainbench.core.figures import check_format
-from brainbench.core.files import CACHE_VARIABLE, cache_dir, check_folder
+from brainbench.core.files import cache_dir, check_folder
 from brainbench.core.limits import bounds_of, check_value
 from brainbench.core.reading.hdf5 import LINKED_VARIABLE
 
@@ -534,7 +534,7 @@ def check_requirements(needs: Needs, values: Mapping[str, Any]) -> None:
         extras = ",".join(dict.fromkeys(item.extra for item in lacking.values()))
         raise missing_dependency(*lacking, extra=extras, purpose=next(iter(lacking.values())).purpose)
     if needs.cache:
-        check_folder(cache_dir(), CACHE_VARIABLE)
+        cache_dir()
 
 
 def guard(app: typer.Typer) -> None:

@@ -6,6 +6,7 @@ processes left is swept: 4 of the machine, 6 of the process and 6 at random.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import errno
 import functools
@@ -19,6 +20,7 @@ import platform
 import re
 import secrets
 import shutil
+import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import Field, fields, is_dataclass
 from functools import lru_cache
@@ -136,6 +138,9 @@ def lock_folder(folder: Path, *, wait: bool = True) -> Iterator[bool]:
 
 
 CACHE_VARIABLE = "BRAINBENCH_CACHE"  # environment variable that overrides the platform's cache folder
+KEY_VARIABLE = "BRAINBENCH_CACHE_KEY"
+"""Environment variable that holds the key of the cache itself, for processes that share one and have no settings."""
+KEY, KEY_BYTES = Path("keys", "cache.key"), 32  # the file of that key among the settings, and its size
 CONFIG_VARIABLE = "BRAINBENCH_CONFIG"  # environment variable that overrides the platform's folder of settings
 LIBRARIES = ("numpy", "scipy", "xarray", "h5py", "torch", "warp-lang", "mujoco-core")
 """Distributions on whose version the last digits of a result depend."""
@@ -146,16 +151,46 @@ _UNWRITABLE = (
 
 
 def cache_dir(*parts: str) -> Path:
-    """Return (and create) the cache folder, ``$BRAINBENCH_CACHE`` or the platform's own."""
-    path = user_folder(CACHE_VARIABLE, "user_cache_dir").joinpath(*parts)
+    """Return (and create) the cache folder, ``$BRAINBENCH_CACHE`` or the platform's own.
+
+    In place of one that this user may not write, such as a shared one or that of a read-only home, it is a temporary
+    folder with all that stands there, until this process ends.
+    """
+    root = user_folder(CACHE_VARIABLE, "user_cache_dir")
+    path, fault = root.joinpath(*parts), errno.EACCES
     try:
         path.mkdir(parents=True, exist_ok=True)
+        if os.access(path, os.W_OK | os.X_OK):
+            return path
     except OSError as error:
-        raise FileWriteError(
-            f"The cache folder {brief(str(path))} cannot be made ({error.strerror}); name a folder that can be written "
-            f"with the environment variable {CACHE_VARIABLE}."
-        ) from error
-    return path
+        fault = error.errno or fault
+        if fault not in (errno.EACCES, errno.EPERM, errno.EROFS):
+            raise FileWriteError(
+                f"The cache folder {brief(str(path))} cannot be made ({error.strerror}); name a folder that can be "
+                f"written with the environment variable {CACHE_VARIABLE}."
+            ) from error
+    # Processes that this one starts share it.
+    os.environ[CACHE_VARIABLE] = str(_linked_cache(root))
+    _LOG.warning(
+        "The cache folder %s cannot be written (%s): what is made is kept until this process ends. "
+        "Name another folder with %s.", root, os.strerror(fault), CACHE_VARIABLE,
+    )  # fmt: skip
+    return cache_dir(*parts)
+
+
+def _linked_cache(root: Path) -> Path:
+    """Return a temporary folder, removed when this process ends, with links to the entries of a cache."""
+    copy = Path(tempfile.mkdtemp(prefix="brainbench-cache-"))
+    atexit.register(shutil.rmtree, copy, ignore_errors=True)
+    for folder, _, names in os.walk(root.absolute()):
+        place = copy / Path(folder).relative_to(root.absolute())
+        place.mkdir(exist_ok=True)
+        for name in names:
+            with contextlib.suppress(OSError):  # seals are added to, and those of others may not be read
+                (shutil.copyfile if name.endswith(".seal") else os.symlink)(Path(folder, name), place / name)
+    if not (settings_dir() / KEY).is_file():  # what is not kept needs no key that is kept
+        os.environ.setdefault(KEY_VARIABLE, secrets.token_hex(KEY_BYTES))
+    return copy
 
 
 def settings_dir() -> Path:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import math
@@ -32,6 +33,7 @@ from brainbench.core.files import (
     write_tensors,
     write_text,
 )
+from brainbench.core.reading.sealed import read_sealed, write_sealed
 from brainbench.core.reading.tensors import read_tensors
 
 KILLED = """
@@ -198,6 +200,51 @@ def test_an_empty_variable_does_not_make_the_working_folder_the_cache(tmp_path: 
     monkeypatch.setenv(files.CACHE_VARIABLE, "")
     assert tmp_path / "usual" in files.cache_dir("stimuli").parents
     assert not (tmp_path / "stimuli").exists()
+
+
+def _unwritable(monkeypatch, *folders):
+    access = os.access
+    # Whoever runs the tests may be allowed everything.
+    allowed = lambda path, mode: access(path, mode) and not (mode & os.W_OK and Path(path) in folders)  # noqa: E731
+    monkeypatch.setattr(os, "access", allowed)
+
+
+def test_a_filled_cache_that_cannot_be_written_is_read_and_left_as_it_is(tmp_path, monkeypatch, caplog):
+    root = tmp_path / "cache"
+    monkeypatch.setenv(files.CACHE_VARIABLE, str(root))
+    for name in ("old", "renewed"):
+        write_sealed(files.cache_dir("numbers") / f"{name}.npz", "numbers", {"x": [1.0]})
+    before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+    _unwritable(monkeypatch, root / "numbers")
+    folder = files.cache_dir("numbers")
+    assert root not in folder.parents
+    assert read_sealed(folder / "old.npz", "numbers") == {"x": [1.0]}
+    for name in ("new", "renewed"):
+        write_sealed(folder / f"{name}.npz", "numbers", {"x": [2.0]})
+        assert read_sealed(folder / f"{name}.npz", "numbers") == {"x": [2.0]}
+    assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
+    assert files.cache_dir("other").parent == folder.parent
+    (message,) = [record.getMessage() for record in caplog.records]
+    assert message.startswith(f"The cache folder {root} cannot be written (Permission denied)")
+
+
+def test_a_home_that_is_read_only_has_a_cache_until_the_process_ends(tmp_path, monkeypatch, caplog):
+    monkeypatch.setenv(files.CACHE_VARIABLE, str(tmp_path / "home" / "cache"))
+    monkeypatch.setenv(files.CONFIG_VARIABLE, str(tmp_path / "home" / "settings"))
+    monkeypatch.setenv(files.KEY_VARIABLE, "")  # restored after the test
+    monkeypatch.delenv(files.KEY_VARIABLE)
+    make = Path.mkdir
+
+    def refuse(path, *arguments, **options):
+        if tmp_path in path.parents:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        make(path, *arguments, **options)
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    folder = files.cache_dir("numbers")
+    write_sealed(folder / "new.npz", "numbers", {"x": [2.0]})
+    assert read_sealed(folder / "new.npz", "numbers") == {"x": [2.0]}
+    assert len(caplog.records) == 1
 
 
 @pytest.mark.skipif(os.name != "posix", reason="home folders are found otherwise")

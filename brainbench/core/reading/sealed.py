@@ -24,14 +24,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError
-from brainbench.core.files import atomic_path, content_hash, library_versions, settings_dir, state_hash, write_private
+from brainbench.core.files import (
+    KEY,
+    KEY_BYTES,
+    KEY_VARIABLE,
+    atomic_path,
+    content_hash,
+    library_versions,
+    settings_dir,
+    state_hash,
+    write_private,
+)
 from brainbench.core.reading.hdf5 import trust_hdf5
 from brainbench.core.reading.tensors import read_npz
 
 T = TypeVar("T")
-KEY_VARIABLE = "BRAINBENCH_CACHE_KEY"
-"""Environment variable that holds the key itself, for processes that share a cache and have no folder of settings."""
-KEY_BYTES = 32
 _PACKAGE = Path(__file__).parents[2]
 _LOG = logging.getLogger(__name__)
 
@@ -124,7 +131,7 @@ def _key(settings: Path) -> bytes:
     """Return this user's key, made when it is first needed."""
     if stated := os.environ.get(KEY_VARIABLE):
         return stated.encode()
-    path = settings / "keys" / "cache.key"
+    path = settings / KEY
     try:
         if (key := _private_bytes(path)) is None:
             write_private(path, secrets.token_bytes(KEY_BYTES), replace=False)
