@@ -155,6 +155,9 @@ def _serve() -> None:
         answers.write("ready\n")
         answers.flush()
         for line in sys.stdin:
+            # Ours alone, and no byte of the file: what it needs is imported once for all processes that are forked.
+            with contextlib.suppress(Exception):
+                _load(json.loads(line)[0])
             if not hasattr(os, "fork"):
                 answers.write(_answer(line))
             elif (child := os.fork()) == 0:

@@ -13,6 +13,13 @@ from brainbench.core.reading import apart
 from brainbench.core.reading.apart import read_apart
 
 
+IMPORTED_BY = os.getpid()
+
+
+def imports(path):
+    return {"process": np.array([IMPORTED_BY, os.getpid(), os.getppid()])}
+
+
 def whole(path):
     return {"size": np.array(Path(path).stat().st_size), "words": np.array(["a", "b"])}
 
@@ -53,6 +60,14 @@ def test_arrays_come_back(read):
     arrays = read(whole)
     assert arrays["size"] == 3
     assert arrays["words"].tolist() == ["a", "b"]
+
+
+def test_what_reads_files_is_imported_once_for_all_of_them(read):
+    imported, first, parent = read(imports)["process"].tolist()
+    assert imported == parent != first
+    again = read(imports)["process"].tolist()
+    assert again[0] == imported
+    assert again[1] != first
 
 
 @pytest.mark.parametrize(
