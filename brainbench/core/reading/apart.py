@@ -157,7 +157,8 @@ def _serve() -> None:
         for line in sys.stdin:
             # Ours alone, and no byte of the file: what it needs is imported once for all processes that are forked.
             with contextlib.suppress(Exception):
-                _load(json.loads(line)[0])
+                for function in json.loads(line)[: 2 if ":save_arrays" in line else 1]:
+                    _load(function)
             if not hasattr(os, "fork"):
                 answers.write(_answer(line))
             elif (child := os.fork()) == 0:

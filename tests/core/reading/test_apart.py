@@ -12,7 +12,6 @@ from brainbench.core.errors import DataError
 from brainbench.core.reading import apart
 from brainbench.core.reading.apart import read_apart
 
-
 IMPORTED_BY = os.getpid()
 
 
