@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, norm
@@ -84,6 +85,7 @@ _SUSPECT, _DOUBTED, _TOUCH = 1.5, 3.0, 2.5
 """Standard errors by which a taxel is explained worse than the median one: to try other places; to doubt the fit."""
 _NUDGES = (-3e-5, 3e-5, -1e-4, 1e-4)
 """Moves (m) of such a taxel along its normal, by which its touches begin a reading sooner or later."""
+_CLEARLY = 0.1  # mean correlation by which columns must suit other taxels better than their own
 _CHANCE = 0.02  # part of the readings that a wrong order of axes may explain more than the right one
 _MOVES = (-2e-3, 0.0, 2e-3)  # places (m) beside its own at which a taxel that nothing else explains is tried
 
@@ -93,7 +95,7 @@ class Fault:
     """Something about a device that is not as it should be."""
 
     kind: str
-    """``shifted``, ``turned``, ``axes``, ``gain``, ``friction``, ``delay`` or ``dead``."""
+    """``order``, ``shifted``, ``turned``, ``axes``, ``gain``, ``friction``, ``delay`` or ``dead``."""
     taxel: str
     """Name of the taxel; empty for the whole device."""
     text: str
@@ -154,7 +156,7 @@ class DeviceFit:
 def fit_device(presses: Presses, *, max_delay: float = 0.5, names: tuple[str, ...] = ()) -> DeviceFit:
     """Fit law, friction, damping, crosstalk, hysteresis, delay, places, normals, gains and noise of a device at once.
 
-    The last fifth of the touches is held out.
+    The last fifth of the touches is held out. Columns of the log that stand in the order of other taxels are put right.
     """
     names = names if len(names) == len(presses.probes) else tuple(map(str, range(len(presses.probes))))
     readings, mixing = presses.readings, crosstalk_of(presses.probes)
@@ -168,6 +170,13 @@ def fit_device(presses: Presses, *, max_delay: float = 0.5, names: tuple[str, ..
     if not touched.any():
         raise DataError("Every taxel of the log is stuck at one value, so nothing can be fitted.")
     search = _Search(used, touched, mixing, max_delay)
+    columns = search.columns(~stuck)
+    if len(moved := np.flatnonzero(columns != np.arange(len(columns)))):
+        log = replace(presses.log, readings=readings[:, columns].reshape(len(readings), -1), probes=())
+        fit = fit_device(Presses(log, presses.probes, presses.radius), max_delay=max_delay, names=names)
+        pairs = listing((f"that of {names[columns[n]]} reads what {names[n]} should" for n in moved), limit=6)
+        text = f"columns of the log stand in another order than the taxels: {pairs}; the fit has put them right"
+        return replace(fit, faults=[Fault("order", "", text), *fit.faults])
     search.search()
     search.device = _renamed(search.device)
     noise = search.finish()
@@ -378,6 +387,24 @@ class _Search:
     def covariance(self) -> NDArray[np.float64]:
         """Return that of all numbers [P, P]."""
         return np.linalg.inv(self.normal_equations(self.reply, self.device, robust=False)[0])
+
+    def columns(self, living: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Return the column [N] of the log that reads what each taxel should, which is its own where that is unclear.
+
+        A ball touches the taxels one after the other, so the course of a column says whose it is.
+        """
+        seen = np.linalg.norm(self.readings - np.median(self.readings, axis=0), axis=2)
+        due = np.linalg.norm(readings_of(self.presses, self.device, self.mixing) - self.device.bias, axis=2)
+        reached = due.any(axis=0)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            alike = np.corrcoef(seen.T, due.T)[: len(living), len(living) :]
+        alike = np.where(living[:, None] & reached, np.nan_to_num(alike), 0.0)
+        columns, taxels = linear_sum_assignment(-alike)
+        order = columns[np.argsort(taxels)]
+        order[~reached] = np.setdiff1d(columns, order[reached])
+        gains = alike[order, np.arange(len(order))] - np.diag(alike)
+        moved = reached & (order != np.arange(len(order)))
+        return order if gains[moved].sum() > _CLEARLY * moved.sum() else np.arange(len(order))
 
     def straightened(self, device: Device, suspects: NDArray[np.int64]) -> Device:
         """Return a device with the order and sense of axes and the place of suspects that explain them best."""

@@ -83,6 +83,39 @@ def test_a_device_that_reads_what_it_does_to_the_ball_is_fitted_and_named(axes: 
     assert [(fault.kind, fault.taxel, fault.text) for fault in fit.faults] == [("axes", "", f"all taxels {text}")]
 
 
+@pytest.mark.parametrize(
+    ("kind", "order"),
+    [
+        ({"shape": (2, 2), "touches": 12}, [1, 0, 2, 3]),
+        ({"shape": (2, 2), "touches": 12, "axes": 1}, [1, 2, 3, 0]),
+        ({"shape": (3, 3)}, [8, 7, 6, 5, 4, 3, 2, 1, 0]),
+        ({"shape": (3, 3)}, [0, 3, 6, 1, 4, 7, 2, 5, 8]),
+    ],
+)
+def test_columns_in_another_order_than_the_taxels_are_named_and_put_right(kind, order) -> None:
+    """Near taxels were said to be shifted, and far ones left the fit uncertain without a word of their order."""
+    presses = plant(0, **kind).presses
+    log, count = presses.log, len(order)
+    parts = log.readings.reshape(len(log.time), count, -1)
+    mixed = Presses(replace(log, readings=parts[:, order].reshape(len(log.time), -1)), presses.probes, presses.radius)
+    fit, right = fit_device(mixed), fit_device(presses)
+    assert [fault.kind for fault in right.faults] == []
+    (fault,) = fit.faults
+    assert fault.kind == "order"
+    column = order.index(0)  # of the first taxel
+    assert column == 0 or f"that of {column} reads what 0 should" in fault.text
+    assert (fit.status, fit.held_out, fit.law()) == (right.status, right.held_out, right.law())
+
+
+def test_a_dead_column_among_exchanged_ones_is_still_named() -> None:
+    presses = plant(0, shape=(2, 2), touches=12).presses
+    parts = presses.log.readings.reshape(len(presses.log.time), 4, -1)[:, [1, 0, 2, 3]].copy()
+    parts[:, 0] = 0.5
+    log = replace(presses.log, readings=parts.reshape(len(parts), -1))
+    fit = fit_device(Presses(log, presses.probes, presses.radius))
+    assert [(fault.kind, fault.taxel) for fault in fit.faults] == [("order", ""), ("dead", "1")]
+
+
 def test_a_device_of_one_channel_is_recovered() -> None:
     planted = plant(3, shape=(2, 2), touches=12, axes=1)
     fit = fit_device(planted.presses)
