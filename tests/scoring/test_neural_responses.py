@@ -2,13 +2,15 @@ import numpy as np
 import pytest
 
 from brainbench import score
+from brainbench.core.contracts import Trials
 from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import write_recordings
 from brainbench.datasets.sessions import make_session
 from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry
 from brainbench.metrics import get_metric
+from brainbench.metrics.reliability.halves import reliable_units, tuning_by_chance
 from brainbench.models.features import write_features
-from brainbench.scoring.neural_responses import open_neural_responses
+from brainbench.scoring.neural_responses import BY_CHANCE, open_neural_responses
 from brainbench.scoring.options import ScoreOptions
 from brainbench.scoring.scores import score_record
 from tests.factories.recordings import as_recordings
@@ -164,6 +166,43 @@ def test_units_that_were_chosen_by_chance_put_every_score_in_doubt(features):
     sound = score(features(6), recordings=tuned, units_reliability=0.5)
     assert sound.status == "ok"
     assert doubt not in " ".join(sound.reasons)
+
+
+def _gated_study(seed, stimuli=6, trials=10, animals=6, units=60, dimensions=4):
+    """Return the share of tuning by chance, whether a score is ok, its error, and whether its interval holds it."""
+    rng, metric, labels = np.random.default_rng([seed, 3]), get_metric("rsa"), np.repeat(np.arange(stimuli), trials)
+    tuned, size = rng.choice([0.03, 0.06, 0.1, 0.15, 0.25, 0.5]), rng.choice([0.3, 0.45, 0.6, 0.9]) * np.sqrt(0.8)
+    shared, other = rng.normal(size=(2, stimuli, dimensions))
+    blocks, chosen, true = [], [], []
+    for index in range(animals):
+        means = np.sqrt(0.8) * shared + np.sqrt(0.2) * rng.normal(size=shared.shape)
+        means = size * means @ rng.normal(size=(dimensions, units)) / np.sqrt(dimensions)
+        means *= rng.random(units) < tuned
+        blocks.append(Trials(means[labels] + rng.normal(size=(len(labels), units)), labels))
+        reliable, _ = reliable_units(blocks[-1:], stimuli, least=0.5)
+        if reliable and means.any():
+            chosen.append(metric.animal(str(index), reliable, stimuli, splits=20))
+            exact = means[labels] + 1e-3 * size * rng.normal(size=(len(labels), units))
+            true.append(metric.animal(str(index), [Trials(exact, labels)], stimuli, splits=20))
+    layer = (shared + other) @ rng.normal(size=(dimensions, 100))
+    names = [str(number) for number in range(stimuli)]
+    score, truth = (metric.score({"layer": layer}, side, name="x", stimuli=names) for side in (chosen, true))
+    interval = score.scaled_interval
+    inside = interval is None or interval.low <= truth.scaled <= interval.high
+    share = tuning_by_chance(blocks, stimuli, least=0.5)
+    return share, score.status == "ok", score.scaled - truth.scaled, inside
+
+
+@pytest.mark.slow
+def test_scores_of_units_that_pass_by_chance_are_doubted_from_where_they_err_by_a_tenth():
+    # Of 370 studies: root mean square errors of .04 below .3, .10 from .3 to .5, .16 above.
+    share, ok, error, inside = np.array([_gated_study(seed) for seed in range(120)]).T
+    below, above = (ok > 0) & (share <= BY_CHANCE), (ok > 0) & (share > BY_CHANCE)
+    sizes = [float(np.sqrt(np.mean(error[rows] ** 2))) for rows in (below, above)]
+    assert (below.sum(), above.sum()) > (30, 15)
+    assert inside[below].mean() > 0.95
+    assert abs(error[below].mean()) < 0.03
+    assert sizes[0] < 0.1 < sizes[1]
 
 
 def test_bins_that_are_features_are_no_neurons():
