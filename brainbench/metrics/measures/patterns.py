@@ -469,7 +469,8 @@ class SoftMatching(UnitMatching):
 
     This is the optimal transport between both. Where one side has a multiple of the other's number its solution is an
     assignment of copies; so the features of a larger layer are a random sample of a multiple of the units' number. Of a
-    smaller layer each unit gets one feature, and each feature at most a unit more than its share.
+    smaller layer there are as many copies as units: the rest after whole copies of all features is drawn at random, for
+    a choice that suits the units is worth more than equal masses (.78 for .73 of 40 features and 60 units).
     """
 
     name = "soft-matching"
@@ -485,20 +486,21 @@ class SoftMatching(UnitMatching):
         return _ordered(super().partner(animal, others))
 
     def chosen(self, features: int, units: int) -> Ints:
-        """Return a sample of the features, a multiple of the units in number where there are as many."""
-        if features <= units or not units:
+        """Return a sample of the features, or copies of all and a sample: a multiple of the units in number."""
+        if not features or not units:
             return np.arange(features)
-        size = units * (min(features, max(MOST_FEATURES, units)) // units)
-        return np.sort(np.random.default_rng(features).permutation(features)[:size])
+        order = np.random.default_rng(features).permutation(features)
+        if features < units:
+            return np.concatenate([np.tile(np.arange(features), units // features), order[: units % features]])
+        return np.sort(order[: units * (min(features, max(MOST_FEATURES, units)) // units)])
 
     def pairs(self, likeness: Floats) -> tuple[Ints, Ints]:
         """Return the units [M] and the features [M] that share mass; all shares are equal."""
-        units, features = likeness.shape
         if not likeness.size:
             return super().pairs(likeness)
-        copies = np.array([max(1, -(-features // units)), max(1, -(-units // features))])
-        rows, columns = super().pairs(likeness.repeat(copies[0], axis=0).repeat(copies[1], axis=1))
-        return rows // copies[0], columns // copies[1]
+        copies = max(1, likeness.shape[1] // len(likeness))
+        rows, columns = super().pairs(likeness.repeat(copies, axis=0))
+        return rows // copies, columns
 
 
 @dataclass(frozen=True)
