@@ -10,7 +10,6 @@ import inspect
 import math
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
