@@ -560,7 +560,9 @@ def _guarded(name: str, command: Callable[..., Output]) -> Callable[..., None]:
     parameters = inspect.signature(command, eval_str=True).parameters.values()
     kind = inspect.Parameter.KEYWORD_ONLY
     more = (inspect.Parameter(key, kind, default=default, annotation=hint) for key, hint, default in added)
-    return _as_command(run, command, (*parameters, *more))
+    guarded = _as_command(run, command, (*parameters, *more))
+    guarded.needs = needed
+    return guarded
 
 
 def commands(app: typer.Typer, path: str = "") -> Iterator[tuple[str, Any]]:
