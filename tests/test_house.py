@@ -39,7 +39,7 @@ BUDGETS = {
     # boards of areas, what stimuli and units add to a score, for readers of a report
     "brainbench/scoring": 4_420,  # presentation time, plans, areas and layers, stimuli of single trials, doubts,
     # reliability without the mean distance, copies among candidates and among stimuli
-    "brainbench/geometry": 1_000,
+    "brainbench/geometry": 1_010,
     "brainbench/published": 2_480,
     "brainbench/benchmarks": 710,
     "tests/factories": 5_370,  # what at least two test modules, or a test and a benchmark, make
@@ -47,7 +47,7 @@ BUDGETS = {
 }
 """Folder → lines of Python that it may have: as the rooms stand, with two per cent to move in. Who adds a capability
 pays in the same folder, or raises the number in the commit that needs it, with the reason."""
-MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 97_590, 393
+MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 97_600, 393
 """Lines grew last by responses of any kind, errors of sweeps, boards of 10,000 records, ONNX files tried apart, drift
 over time, files of torch_brain and rsatoolbox both ways, real tactile devices fitted jointly to presses, air flow,
 rest shapes in space, species files, stimuli of single trials, contacts on the bent rod, claims scored again,

@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -393,7 +393,11 @@ def test_a_hemisphere_wraps_half_way_round_its_centre():
     assert winding_number(Mesh(ball.vertices, upper), [[0, 0, 0]])[0] == pytest.approx(0.5, abs=0.01)
 
 
+SLIVER = [[-0.25, 0.0, 0.0], [0.0, 3.6e-7, 0.0], [-0.75, 0.0, 0.0], [0.0, 0.0, 0.0]]
+
+
 @settings(max_examples=60)
+@example(np.array(SLIVER))
 @given(arrays(float, (4, 3), elements=st.floats(-1, 1, width=32)))
 def test_the_distance_from_a_triangle_is_that_of_its_nearest_point(corners):
     point, triangle = corners[0], corners[1:]
