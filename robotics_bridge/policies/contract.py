@@ -11,7 +11,7 @@ import json
 import logging
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
 
@@ -89,28 +89,30 @@ class TrainedMap(ActionMap):
 class PolicyContract:
     """What the file of an exported policy reads, and what a robot needs to run it: the latter as files hold it."""
 
+    inputs: Mapping[str, tuple[int, ...]]
+    """Group → shape, in the order of the file."""
     rate: Annotated[float, Meta(ge=RATE[0], le=RATE[1])]
     """Control steps per second."""
     hand: Name
     """Name of the hand that it was trained on."""
     joints: Names
     """All driven joints J, in the order of ``proprio``."""
+    moved: tuple[Name, ...]
+    """Joints A that actions move."""
     action_map: TrainedMap
-    """Map from actions to targets of the joints A that it moves."""
+    """Map from actions to targets of the joints A; its rows by name may be given, without the names of joints."""
     frozen: dict[str, Angle]
     """Joint → position (rad) of those that actions do not move."""
-    twist: Annotated[float, Meta(ge=0, le=MOST_TWIST)] | None = None
-    """Torsional friction of force taxels [N·m·s]; None: they hold. The rest is None where nothing is stated."""
-    contacts: ContactModel = CONTACTS["published"]
-    """Contact model in which it was trained."""
-    inputs: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
-    """Group → shape, in the order of the file."""
     links: tuple[Name, ...] = ()
     """Links with touch, in the order of ``tactile``."""
     observe: str = "none"
     """Tactile observation type."""
     sha256: str = ""
     """Hash of the file of the network; empty in contracts of earlier versions."""
+    contacts: ContactModel = CONTACTS["published"]
+    """Contact model in which it was trained."""
+    twist: Annotated[float, Meta(ge=0, le=MOST_TWIST)] | None = None
+    """Torsional friction of force taxels [N·m·s]; None: they hold. The rest is None where nothing is stated."""
     task: Name | None = None
     placement: Name | None = None
     resolution: Name | None = None
@@ -123,10 +125,10 @@ class PolicyContract:
     starts: Name | None = None
     """What episodes began with, such as ``grasps``, and actions were counted from; None: from ``action_map``."""
 
-    @property
-    def moved(self) -> tuple[str, ...]:
-        """Joints A that actions move."""
-        return self.action_map.names
+    def __post_init__(self) -> None:
+        if isinstance(self.action_map, Mapping):
+            object.__setattr__(self, "action_map", TrainedMap(self.moved, **self.action_map))
+        object.__setattr__(self, "moved", self.action_map.names)
 
     @classmethod
     def read(cls, path: Path) -> PolicyContract:
@@ -149,7 +151,9 @@ class PolicyContract:
                 f"The contract {where!r} does not say {missing[0]!r}, so no hand can run the policy; "
                 "export it from a trained run."
             )
-        written = from_json(_Written, document, where)
+        # A file says the inputs elsewhere, and the joints that move in the map of actions alone.
+        deployment = {**deployment, "inputs": {}, "moved": ()}
+        written = from_json(_Written, {**document, "deployment": deployment}, where)
         given, inputs = written.deployment, shapes_of(written.inputs, where, "inputs")
         joints, moved = given.joints, given.moved
         if sorted((*moved, *given.frozen)) != sorted(joints) or repeats(joints):

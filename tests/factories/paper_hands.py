@@ -69,7 +69,7 @@ def still_map(joints: tuple[str, ...]) -> TrainedMap:
 
 def make_contract(groups=("proprio",), rate=40.0) -> PolicyContract:
     actions = TrainedMap(("a", "c"), default=(0.1, 0.2), scale=(0.5, 0.5), low=(-1.0, 0.0), high=(1.0, 0.4))
-    return PolicyContract(rate, "paper", JOINTS, actions, {"b": 0.3}, inputs=dict.fromkeys(groups, (1,)))
+    return PolicyContract(dict.fromkeys(groups, (1,)), rate, "paper", JOINTS, ("a", "c"), actions, {"b": 0.3})
 
 
 def make_limits(**changes) -> SafetyLimits:

@@ -65,7 +65,7 @@ def _controller(hand, policy, *, rate=40.0, **mapping):
     parts = {"default": (0.0, 0.0), "scale": (1.0, 1.0), "low": (-1.0, -1.0), "high": (1.0, 1.0), **mapping}
     limits = SafetyLimits(-np.ones(2), np.ones(2), np.full(2, 8.0), timeout=2.0)
     actions: Any = ActionMap(hand.joints, **parts)
-    contract = PolicyContract(rate, "paper", hand.joints, actions, {}, inputs={"proprio": (6,)})
+    contract = PolicyContract({"proprio": (6,)}, rate, "paper", hand.joints, hand.joints, actions, {})
     return Controller(policy, hand, contract, limits, clock=_Ticks())
 
 

@@ -357,7 +357,7 @@ def _touching(observe: str, shape: tuple[int, ...]) -> PolicyContract:
     body = hands.load("xhand1")
     links = (body.palm, body.fingers["index"][-1], body.fingers["thumb"][-1])
     still = still_map(JOINTS)
-    return PolicyContract(40.0, "xhand1", JOINTS, still, {}, inputs={"tactile": shape}, links=links, observe=observe)
+    return PolicyContract({"tactile": shape}, 40.0, "xhand1", JOINTS, JOINTS, still, {}, links, observe)
 
 
 def test_real_values_fill_all_slots_and_simulated_ones_the_rest() -> None:

@@ -9,7 +9,7 @@ from robotics_bridge.deploy.driver import DriverRequest, open_driver
 from robotics_bridge.policies.contract import PolicyContract
 from tests.factories.paper_hands import still_map
 
-CONTRACT = PolicyContract(40.0, "xhand1", ("a",), still_map(("a",)), {}, inputs={"proprio": (36,)})
+CONTRACT = PolicyContract({"proprio": (36,)}, 40.0, "xhand1", ("a",), ("a",), still_map(("a",)), {})
 
 
 @pytest.mark.parametrize(

@@ -9,11 +9,12 @@ import copy
 import json
 import logging
 import math
-from dataclasses import asdict, astuple
+from dataclasses import asdict, astuple, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from brainbench.core.errors import BrainbenchError, DataError, UsageError
@@ -305,3 +306,12 @@ def test_a_hand_whose_file_was_changed_is_told(tmp_path: Path, caplog: pytest.Lo
             check_hand(described, env(jaws.replace(old, new)), "mine")
         assert "'mine' was trained" in caplog.text
         caplog.clear()
+
+
+def test_a_contract_takes_the_rows_of_its_map_of_actions() -> None:
+    rows: Any = {"default": (0.0, 0.1), "scale": (0.5, 0.4), "low": (-1.0, -0.5), "high": (1.0, 0.5)}
+    contract = PolicyContract({"proprio": (6,)}, 40.0, "paper", ("a", "b"), ("b", "a"), rows, {})
+    assert contract.moved == contract.action_map.names == ("b", "a")
+    assert contract.action_map.targets(np.array([1.0, -2.0])).tolist() == [0.5, -0.5]
+    with pytest.raises(ValueError, match="'scale' has 1 numbers for 2 joints"):
+        replace(contract, action_map=rows | {"scale": (0.5,)})

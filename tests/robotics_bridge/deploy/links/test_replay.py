@@ -44,7 +44,7 @@ PLACES = [[getattr(probes, name)[probes.active] for probes in PROBES.values()] f
 LINKS = tuple(np.repeat(list(PROBES), list(map(len, PLACES[0]))).tolist())
 POINTS = TactilePoints(LINKS, *map(np.concatenate, PLACES))
 SESSION = SessionFacts(task="turn the ball", fps=40, joints=HAND.joints, points=POINTS, robot="xhand1", unit="N")
-CONTRACT = PolicyContract(40.0, "xhand1", HAND.joints, still_map(HAND.joints), {})
+CONTRACT = PolicyContract({}, 40.0, "xhand1", HAND.joints, HAND.joints, still_map(HAND.joints), {})
 
 
 def _frames(length: int) -> dict[str, np.ndarray]:

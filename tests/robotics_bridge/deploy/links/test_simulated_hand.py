@@ -30,8 +30,8 @@ def _reading(position, pressure=None, *, step: int = 0, velocity=None) -> HandRe
 def _contract(observe: str, joints: tuple[str, ...] = HAND.joints) -> PolicyContract:
     links = tuple(HAND.layout("low", "hand"))
     more = {"placement": "hand", "resolution": "low", "sub_steps": 5, "twist": None, "contacts": CONTACTS["firm"]}
-    more |= {"inputs": {"tactile": (5, len(links), 3)}, "links": links, "observe": observe}
-    return PolicyContract(40.0, "xhand1", joints, still_map(joints), {}, **more)
+    inputs, still = {"tactile": (5, len(links), 3)}, still_map(joints)
+    return PolicyContract(inputs, 40.0, "xhand1", joints, joints, still, {}, links, observe, **more)
 
 
 def test_it_follows_the_reported_joints_whatever_their_order_and_feels_the_ball() -> None:

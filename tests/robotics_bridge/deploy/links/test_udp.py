@@ -10,6 +10,7 @@ import re
 import socket
 import threading
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -35,7 +36,7 @@ from robotics_bridge.deploy.links.udp import (
     read_key,
 )
 from robotics_bridge.deploy.safety import SafeLink, SafetyLimits
-from robotics_bridge.policies.contract import PolicyContract, TrainedMap
+from robotics_bridge.policies.contract import PolicyContract
 
 JOINTS, FINGERS, KEY = ("a", "b"), ("thumb",), new_key()
 
@@ -87,8 +88,8 @@ def _until(condition, seconds: float = 1.2) -> None:
 
 def _contract(joints, default, low) -> PolicyContract:
     values = {"default": default, "scale": 1.0, "low": low, "high": 1.0}
-    actions = TrainedMap(joints, **{name: (value,) * len(joints) for name, value in values.items()})
-    return PolicyContract(40.0, "hand", joints, actions, {}, inputs={"proprio": (3 * len(joints),)})
+    actions: Any = {name: (value,) * len(joints) for name, value in values.items()}
+    return PolicyContract({"proprio": (3 * len(joints),)}, 40.0, "hand", joints, joints, actions, {})
 
 
 def _control(driver, seconds=0.6, **limits):
