@@ -15,7 +15,7 @@ from brainbench.core.plugins import load_optional, optional_parts
 if TYPE_CHECKING:
     from brainbench.stimuli.engines.protocol import WhiskerEngine
 
-PHYSICS_VERSION = 11
+PHYSICS_VERSION = 12
 """Version of the physics, part of the name under which simulations are kept in the cache. To be raised whenever a
 change of the code changes what a simulation gives; tests/stimuli/engines/test_golden_wrenches.py says when."""
 

@@ -56,8 +56,7 @@ class Fidelity:
     contact_line: Literal["links", "rod"] | None = field(default=None, metadata={"later": True})
     """What contacts touch: the straight links, whose direction jumps at each joint, or the centre line of the bent rod,
     as beam theory tells it between the joints: with the same links many times nearer where a whisker is held between
-    contacts or slides past one. The backend ``rod`` alone knows it. None: the rod where the backend can, but the links
-    in sweeps past objects that move, many of which meet a whisker head-on."""
+    contacts or slides past one. The backend ``rod`` alone knows it. None: the rod where the backend can."""
     contact_tolerance: Annotated[float, Limit(least=1e-12, most=1e-3)] | None = field(
         default=None, metadata={"later": True}
     )

@@ -72,7 +72,7 @@ class PassiveSweeps(Protocol):
         ...
 
 
-_BY_SWEEP = "wrench", "contact", "unstable", "error"
+_BY_SWEEP = "wrench", "contact", "unstable", "error", "straight"
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,11 +97,15 @@ class SweepBatch:
     """Time steps whose contact forces were not solved (:attr:`brainbench.stimuli.motion.jobs.Trace.unsolved`)."""
     error: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), dtype=np.float32))
     """[sweep, whisker] estimated error (:attr:`brainbench.stimuli.motion.jobs.Trace.error`); NaN without one."""
+    straight: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
+    """[sweep, whisker] True where straight links were touched, because the bent rod gave nothing to be trusted."""
 
     def __post_init__(self) -> None:
         count, _, whiskers, channels = np.shape(self.wrench)
         if not self.error.size:
             object.__setattr__(self, "error", np.full((count, whiskers), np.nan, dtype=np.float32))
+        if not self.straight.size:
+            object.__setattr__(self, "straight", np.zeros((count, whiskers), dtype=bool))
         if channels != 6 or self.contact.shape != (count, whiskers) or self.unstable.shape != (count, whiskers):
             raise UsageError(
                 f"A batch of sweeps has wrenches [n, frame, whisker, 6] and [n, whisker] for contact and unstable; "

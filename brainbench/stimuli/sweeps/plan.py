@@ -163,6 +163,7 @@ def simulate_shard(task: ShardTask, objects: Sequence[BuiltObject] = (), workers
     contact = np.zeros((len(task), whiskers), dtype=np.float32)
     status = np.full((len(task), whiskers), UNUSABLE, dtype=np.uint8)
     error = np.full(contact.shape, np.nan, dtype=np.float32)
+    straight = np.zeros(contact.shape, dtype=np.uint8)
     reasons = [built[owner].reason for owner in task.owner.tolist()]
     counts: dict[str, int] = dict.fromkeys(COUNTS, 0)
     wrench = np.empty((0, *shape[1:]), dtype=np.float32)
@@ -177,7 +178,7 @@ def simulate_shard(task: ShardTask, objects: Sequence[BuiltObject] = (), workers
         )
         if batch.wrench.shape != (len(chosen), *shape[1:]):
             raise UsageError(f"The engine gave wrenches {batch.wrench.shape}; expected {(len(chosen), *shape[1:])}.")
-        error[chosen] = batch.error
+        error[chosen], straight[chosen] = batch.error, batch.straight
         contact[chosen], status[chosen] = batch.contact, np.where(batch.unstable, UNSTABLE, OK)
         for index, reason in zip(chosen.tolist(), batch.reasons, strict=True):
             reasons[index] = reason
@@ -191,6 +192,7 @@ def simulate_shard(task: ShardTask, objects: Sequence[BuiltObject] = (), workers
         **_conditions(task),
         "contact": contact,
         "status": status,
+        "straight": straight,
         **({"error": error} if task.settings.errors else {}),
         "reason": encode_texts(reasons),
         "wrench": np.ascontiguousarray(wrench, dtype="<f4"),
@@ -310,7 +312,7 @@ def _name_axes(file: Any) -> None:
     """Attach the tables as dimension scales, so that xarray opens the file with named axes."""
     axes = {
         "wrench": ("sweep", "time", "whisker", "channel"),
-        **dict.fromkeys(("contact", "status", "error"), ("sweep", "whisker")),
+        **dict.fromkeys(("contact", "status", "straight", "error"), ("sweep", "whisker")),
         **dict.fromkeys(("label", "owner", "reason", *_CONDITIONS), ("sweep",)),
         **dict.fromkeys(("row", "col"), ("whisker",)),
         **dict.fromkeys(("object_class", "object_hash"), ("object",)),
@@ -318,7 +320,7 @@ def _name_axes(file: Any) -> None:
     for scale in ("sweep", "time", "whisker", "channel", "class", "object"):
         file[scale].make_scale(scale)
     for name, scales in axes.items():
-        if name not in file:  # data sets may have no errors
+        if name not in file:  # data sets may have no errors, and converted ones no straight links
             continue
         for axis, scale in enumerate(scales):
             file[name].dims[axis].attach_scale(file[scale])

@@ -154,6 +154,21 @@ def test_what_the_page_calls_not_flagged_is_not(row):
     assert NOT_FLAGGED[row]() == ""
 
 
+@pytest.mark.parametrize("line", ["links", "rod"])
+@pytest.mark.parametrize("links", [8, 20])
+def test_nothing_that_presses_along_a_whisker_goes_through_its_tip_in_silence(line, links):
+    """No step is short enough for it, so that finer ones must not hide it."""
+    jobs = []
+    for part in (Sphere((0, 0, 0), 0.005), Box((0, 0, 0), (0.005, 0.005, 0.005))):
+        for speed, aside in ((0.01, 0.0), (0.1, 2e-3), (1.0, 0.0)):
+            moving = _moving((C2.arc_length + 0.0055, aside, 0), (-speed, 0, 0), part)
+            jobs.append(Job(C2, StillFollicle(), (moving,), np.arange(1, 31) * 2.5e-5 / speed))
+    traces = get_engine("rod").run(jobs, Fidelity(links=links, time_step=2e-4, contact_line=line))
+    silent = [t.penetration for t in traces if t.status == "ok" and not t.wrench.any()]
+    assert max(silent, default=0.0) < 1.5e-5
+    assert sum(trace.status == "unstable" for trace in traces) > 3
+
+
 @pytest.mark.parametrize("engine", ["mujoco", "bullet"])
 @pytest.mark.parametrize("row", ["starts in an object", "has an object at its base"])
 def test_other_engines_share_these_rows(engine, row):

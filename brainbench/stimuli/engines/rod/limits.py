@@ -85,6 +85,9 @@ WIDEST = 0.8
 CREVICE = 0.02, 0.06
 """Overlap (mm) that one step may undo, of straight links and of the bent rod, whose soft tip moves beside its links;
 deeper ones are undone over several steps, without a blow."""
+UNDONE = 0.3
+"""Speed (mm/ms) at which an overlap of the bent rod is undone at most. Where the line between the joints jumps, what a
+step undoes at once would be a blow that grows as the step shrinks."""
 
 
 def contacts_for(capacity: int) -> int:

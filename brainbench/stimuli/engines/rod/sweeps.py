@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
 from itertools import groupby
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -79,11 +80,13 @@ class SweepLauncher:
         self._solver_of = partial(
             WhiskerSolver, device=self.device, needs=MESHES, block=BLOCK, sliced=sliced, bounds=bounds
         )
-        self.fidelity = fidelity
+        self._left_open = fidelity.contact_line is None
+        self.fidelity = fidelity = fidelity.touching(scenes.objects)
         self.solver = self._solver_of([fidelity.chain(whisker) for whisker in self.whiskers], fidelity)
         self._head = grid.head.matrix
         self._origin = np.asarray(grid.head.position)
         self._packed = packed or {}
+        self._lock, self._sliced = Lock(), sliced
         self._objects: dict[str, tuple[float, PackedSurface]] = {}
         angles = base_rotation([mount.angles for mount in mounts])
         frames = zip(mounts, from_matrices(angles), strict=True)
@@ -98,6 +101,8 @@ class SweepLauncher:
         """Give back what is on the device; no launch may follow."""
         for solver in (self.solver, *(solver for _, solver in vars(self).get("finer", ()))):
             solver.free()
+        if "on_links" in vars(self):
+            self.on_links.free()
 
     @cached_property
     def finer(self) -> list[tuple[float, WhiskerSolver]]:
@@ -106,6 +111,12 @@ class SweepLauncher:
         half, chains = halved_step(self.fidelity, least, self.spacing), self.solver.chains
         longer = [more_links(self.fidelity, whisker).chain(whisker) for whisker in self.whiskers]
         return [(HALF_STEP, self._solver_of(chains, half)), (MORE_LINKS, self._solver_of(longer, self.fidelity))]
+
+    @cached_property
+    def on_links(self) -> SweepLauncher:
+        """The same whiskers on straight links, the last resort of those that are unstable on the bent rod."""
+        fidelity = replace(self.fidelity, contact_line="links")
+        return SweepLauncher(self.scenes, fidelity, str(self.device), self._sliced, self._packed)
 
     def launch(
         self,
@@ -177,19 +188,43 @@ class SweepLauncher:
     ) -> SweepBatch:
         """Simulate sweeps as :meth:`launch` takes them, and whiskers that cannot be trusted again with finer steps.
 
+        Where nobody asked for a line of contacts, those that stay unstable are simulated on straight links.
         ``estimated`` [sweep] says whose whiskers get an error.
         """
+        result = self._retried(objects, retry)
+        straight = result.verdict.unstable & (self._left_open and retry > 1)
+        if straight.any():
+            with self._lock:
+                launcher = self.on_links
+            finer = launcher._retried(objects, retry, straight)
+            sound = ~finer.verdict.unstable[:, 0]
+            straight[straight] = sound
+            result = result.replaced(straight, finer.picked(sound))
+        batch = replace(self.batch(result), straight=straight)
+        if estimated is None:
+            return batch
+        which = estimated[:, None] & ~result.verdict.unstable
+        error = self._errors(objects, result, which & ~straight)
+        if straight.any():
+            error[straight] = self.on_links._errors(objects, result, which & straight)[straight]
+        return replace(batch, error=error)
+
+    def _retried(
+        self, objects: Sequence[tuple[str, Sequence[Any]]], retry: int, which: NDArray[np.bool_] | None = None
+    ) -> LaunchResult:
+        """Simulate sweeps, or some of their whiskers [sweep, whisker], and again with finer steps what needs these."""
 
         def launch(tries: Sequence[Try]) -> list[LaunchResult]:
-            some = [(which, finer) for which, finer in tries if which is not None]
+            some = [(mask, finer) for mask, finer in tries if mask is not None]
+            if which is not None:
+                whole = [(which.copy(), finer) for _, finer in tries]
+                for (part, _), (mask, _) in zip(whole, tries, strict=True):
+                    part[which] = True if mask is None else mask[:, 0]
+                some = whole
             result = self.launch(objects, some)
-            return result.split([int(which.sum()) for which, _ in some] or [len(result.wrench)])
+            return result.split([int(mask.sum()) for mask, _ in some] or [len(result.wrench)])
 
-        result = run_with_retries(launch, retry)
-        if estimated is None:
-            return self.batch(result)
-        which = estimated[:, None] & ~result.verdict.unstable
-        return replace(self.batch(result), error=self._errors(objects, result, which))
+        return run_with_retries(launch, retry)
 
     def _errors(
         self, objects: Sequence[tuple[str, Sequence[Any]]], result: LaunchResult, which: NDArray[np.bool_]

@@ -12,7 +12,7 @@ from brainbench.stimuli.engines.rod.limits import LARGE_BEND, STEADY
 from ..algebra import Spatial, spatial, vec2, vec3, vec4
 from ..articulated_body import ChainState
 from ..centre_line import link_direction, place_of
-from ..delassus import PerContact1, PerContact3
+from ..delassus import PerContact1, PerContact3, PerContactInt
 from ..delassus import row as contact_row
 from ..parameters import hinges, real
 from ..state import ChainArrays, PerLink3, WhiskerJob, cubic_weights, row
@@ -364,16 +364,28 @@ def keep_contacts(contacts: wp.ref[StepContacts], rod: wp.ref[RodWalk], h: real,
     weight = h / (h + real(wp.static(STEADY)))
     mean_d = PerContact3()
     steady_d = PerContact3()
+    origin = PerContactInt()
     for k in range(record.taken):
+        # As ``delassus.add_contact``: it goes on with the nearest of the last, and with others of that one.
         contact = rod.records.contact[rod.place, k, index]
-        taper = rod.chains.taper[contact.link, rod.job.whisker]
-        # As ``delassus.add_contact``: it goes on with the last that is so near.
+        closest = real(0.3) * rod.chains.taper[contact.link, rod.job.whisker].arc_length
+        origin[k] = -1
+        for e in range(record.held):
+            apart = wp.abs(rod.records.steady[rod.place, e, index].arc - contact.arc)
+            if apart < closest:
+                closest = apart
+                origin[k] = e
+    for k in range(record.taken):
         mean = vec3()
         steady = vec3()
-        for e in range(record.held):
-            if wp.abs(rod.records.steady[rod.place, e, index].arc - contact.arc) < real(0.3) * taper.arc_length:
-                mean = rod.tangents.mean[p, e, index]
-                steady = rod.tangents.steady[p, e, index]
+        e = contact_row(origin, k)
+        if e >= 0:
+            heirs = real(0.0)
+            for j in range(record.taken):
+                if contact_row(origin, j) == e:
+                    heirs = heirs + real(1.0)
+            mean = rod.tangents.mean[p, e, index] / heirs
+            steady = rod.tangents.steady[p, e, index] / heirs
         force = vec3()
         if k < record.contacts:
             force = contact_row(contacts.change, k)

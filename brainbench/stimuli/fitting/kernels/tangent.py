@@ -12,7 +12,7 @@ The knots of a track move the pose of its body (``move_pose``, the derivative of
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import CAPSULE, CREVICE, CYLINDER, MESH, SPHERE
+from brainbench.stimuli.engines.rod.limits import CAPSULE, CREVICE, CYLINDER, MESH, SPHERE, UNDONE
 
 from ..algebra import JointVector, Spatial, rotate, symmetric_times, unrotate, vec3, vec4
 from ..articulated_body import ChainState, ProximityState, spring_state
@@ -305,11 +305,14 @@ def move_contact(
         v_d = v_d - onward * slide_d - (tangent_d - onward * wp.dot(onward, tangent_d)) * (slide / size)
 
     closing_d = zero
-    if -contact.gap < real(wp.static(CREVICE[smooth])):
+    most = real(wp.static(CREVICE[smooth]))
+    if wp.static(smooth):
+        most = wp.min(most, real(wp.static(UNDONE)) * h)
+    if -contact.gap < most:
         closing_d = -gap_d / h
     found.condition = velocity_block(contacts, k) * v_d - n * closing_d
     if contact_row(contacts.slides, k) == 0:
-        closing = wp.min(-contact.gap, real(wp.static(CREVICE[smooth]))) / h
+        closing = wp.min(-contact.gap, most) / h
         found.condition = found.condition - n_d * closing
         return found
     friction_d = tangents.shape_friction[p, shape]

@@ -59,7 +59,8 @@ def released():
 def test_every_whisker_that_starts_inside_an_object_of_a_data_set_is_flagged(released):
     """Before, those deeper than 3 mm counted as outside: no force, and nothing said."""
     scenes, depth = released
-    batch = simulate_sweeps(scenes, range(len(scenes)), fidelity=COARSE)
+    # As data sets do: on straight links what is unstable on the bent rod.
+    batch = simulate_sweeps(scenes, range(len(scenes)), fidelity=COARSE, retry=5)
     assert (depth > 3e-3).sum() > 15
     assert (batch.unstable | (depth < 2e-5)).all()
     assert not (batch.unstable & (depth == 0)).any()

@@ -15,6 +15,8 @@ from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepGrid, SweepScenes
 pytest.importorskip("warp")
 
 COARSE = Fidelity(links=10, time_step=1e-3)
+DOUBTFUL = Fidelity(links=12, time_step=5e-4, contact_line="links")
+"""On straight links some whiskers past ``brick-0`` need steps over 5, and some over 10."""
 
 
 def test_sweeps_through_the_fast_path_equal_their_scenes():
@@ -53,7 +55,8 @@ def test_whiskers_that_cannot_be_trusted_are_simulated_again_and_no_other_change
 
     objects = resolve_objects(["chair-0"], surfaces=True)
     scenes = SweepScenes(GRIDS["thesis-high"], {name: item.load for name, item in objects.items()})
-    fidelity, chosen = Fidelity(links=10, time_step=5e-4), [0, 140]
+    # Straight links leave more whiskers in doubt.
+    fidelity, chosen = Fidelity(links=10, time_step=5e-4, contact_line="links"), [0, 140]
     once = simulate_sweeps(scenes, chosen, fidelity=fidelity)
     again = simulate_sweeps(scenes, chosen, fidelity=fidelity, retry=5)
     bad, left = once.unstable, again.unstable
@@ -61,7 +64,7 @@ def test_whiskers_that_cannot_be_trusted_are_simulated_again_and_no_other_change
     assert (again.retried, once.retried) == (2, 0)
     assert [bool(words) for words in again.reasons] == left.any(axis=1).tolist()
     # What was simulated again is what a finer simulation of everything gives; nothing else changes.
-    runs = [once, *(simulate_sweeps(scenes, chosen, fidelity=Fidelity(links=10, time_step=h)) for h in (1e-4, 5e-5))]
+    runs = [once, *(simulate_sweeps(scenes, chosen, fidelity=replace(fidelity, time_step=h)) for h in (1e-4, 5e-5))]
     same = np.array([(run.wrench == again.wrench).all(axis=(1, 3)) for run in runs])
     assert (same[0] | same[1:].any(axis=0) | left).all()
     assert (same[1:].any(axis=0) & ~left)[bad].sum() >= bad.sum() / 2
@@ -73,7 +76,7 @@ def test_whiskers_that_finer_steps_do_not_mend_take_steps_twice_as_fine(monkeypa
     monkeypatch.setattr("brainbench.stimuli.engines.trust.SUSPICIOUS_PEAK", 1e9)
     objects = resolve_objects(["brick-0"], surfaces=True)
     scenes = SweepScenes(GRIDS["thesis-high"], {name: item.load for name, item in objects.items()})
-    launcher = SweepLauncher(scenes, Fidelity(links=12, time_step=5e-4))
+    launcher = SweepLauncher(scenes, DOUBTFUL)
     chosen = [("brick-0", [scenes.grid.sweeps("brick-0")[74]])]
     once = launcher.launch(chosen)
     bad = once.verdict.unstable
@@ -92,7 +95,7 @@ def test_whiskers_that_finer_steps_do_not_mend_take_steps_twice_as_fine(monkeypa
 def test_the_error_of_a_whisker_in_finer_steps_is_told_by_half_of_these():
     objects = resolve_objects(["brick-0"], surfaces=True)
     scenes = SweepScenes(GRIDS["thesis-high"], {name: item.load for name, item in objects.items()}, whiskers="A1,A2,C1")
-    launcher = SweepLauncher(scenes, Fidelity(links=12, time_step=5e-4))
+    launcher = SweepLauncher(scenes, DOUBTFUL)
     chosen = [("brick-0", [scenes.grid.sweeps("brick-0")[74]])]
     batch = launcher.trusted(chosen, 5, np.ones(1, dtype=bool))
     lengths = np.array([whisker.arc_length for whisker in launcher.whiskers])
@@ -120,7 +123,7 @@ def _finer(launcher):
 def test_a_whisker_that_cannot_be_trusted_says_why():
     objects = resolve_objects(["brick-0", "chair-0"], surfaces=True)
     scenes = SweepScenes(GRIDS["thesis-high"], {name: item.load for name, item in objects.items()})
-    launcher = SweepLauncher(scenes, Fidelity(links=12, time_step=5e-4))
+    launcher = SweepLauncher(scenes, DOUBTFUL)
     found = set()
     for name, index in (("brick-0", 74), ("chair-0", 168)):
         result = launcher.launch([(name, [scenes.grid.sweeps(name)[index]])])
@@ -132,6 +135,41 @@ def test_a_whisker_that_cannot_be_trusted_says_why():
         assert ["a joint bent by" in reason for reason in reasons] == (status == 1).tolist()
         found |= {reason.split(" ")[0] for reason in reasons[unstable]}
     assert len(found) > 1
+
+
+DEEP = ("pyramid-0", 0, "C3"), ("chair-0", 1, "D1"), ("bottle-0", 0, "C2")
+"""Whiskers that lay .25 to .5 mm deep: across edges between two faces, and where one contact becomes two."""
+
+
+def test_whiskers_beside_edges_and_where_contacts_part_do_not_sink_into_an_object():
+    objects = resolve_objects(["procedural-24:1"], surfaces=True)
+    loaders = {name: item.load for name, item in objects.items() if name in {owner for owner, *_ in DEEP}}
+    scenes = SweepScenes(GRIDS["thesis-high"], loaders, whiskers="C2,C3,D1")
+    launcher, names = SweepLauncher(scenes, Fidelity.preset("fast")), scenes.array.names
+    for owner, place, whisker in DEEP:
+        result = launcher.launch([(owner, scenes.grid.sweeps(owner)[place : place + 1])])
+        depth = result.depth[0, names.index(whisker)]
+        assert result.counts["touching"][0, names.index(whisker)] > 0
+        assert depth < 1.2e-4, (owner, whisker, depth)
+
+
+@pytest.mark.slow
+def test_what_jumps_between_joints_makes_no_blow_that_grows_as_steps_shrink():
+    objects = resolve_objects(["house-0"], surfaces=True)
+    scenes = SweepScenes(GRIDS["thesis-high"], {name: item.load for name, item in objects.items()}, whiskers="C2")
+    launcher = SweepLauncher(scenes, Fidelity.preset("fast"))
+    tries = [(np.ones((1, 1), dtype=bool), divisor) for divisor in (1, 5)]
+    result = launcher.launch([("house-0", scenes.grid.sweeps("house-0")[3:4])], tries)
+    usual, finer = np.linalg.norm(result.wrench[:, :, 0, :3], axis=-1).max(axis=1)
+    assert usual > 0
+    # It was four times the force.
+    assert finer < 1.2 * usual
+
+
+def test_sweeps_touch_the_bent_rod_unless_links_are_asked_for():
+    scenes = _few_sweeps()
+    lines = [SweepLauncher(scenes, replace(COARSE, contact_line=line)).solver.smooth for line in (None, "rod", "links")]
+    assert lines == [True, True, False]
 
 
 def _few_sweeps(**grid):
@@ -163,7 +201,8 @@ def test_an_object_too_fast_to_be_followed_is_told_of_in_sweeps_as_in_scenes(pat
 
 def test_a_force_that_no_whisker_bears_is_flagged_in_sweeps_and_not_tried_again():
     scenes = _few_sweeps()
-    launcher = SweepLauncher(scenes, COARSE)
+    # Straight links bear the object, which meets D2 head-on.
+    launcher = SweepLauncher(scenes, replace(COARSE, contact_line="links"))
     (name,) = scenes.objects
     sound = launcher.trusted([(name, scenes.grid.sweeps(name))], 5)
     assert not sound.unstable.any()

@@ -37,7 +37,7 @@ from brainbench.stimuli.motion.jobs import MILLI
 
 from .algebra import JointVector, Spatial, first_axis, rotate, vec3
 from .articulated_body import ChainState, ProximityState, hinge_direction
-from .centre_line import RodPlace, bent_link, enter_link, shortening
+from .centre_line import RodPlace, bent_link, enter_link, linearity, shortening
 from .distances import segments
 from .motion import BodyMotion, elapsed, instant, pose_at, pose_from
 from .narrow_phase import link_shape_distance
@@ -51,9 +51,8 @@ from .state import (
     ContactCandidates,
     ContactProblems,
     LinkDistance,
+    NearShapes,
     PausedWhiskers,
-    PerListed1,
-    PerListedInt,
     SceneArrays,
     Step,
     WhiskerJob,
@@ -67,22 +66,6 @@ from .state import (
 
 if recorded:
     from .recorder.recording import record_candidate
-
-
-@wp.struct
-class NearShapes:
-    """The shapes nearest to a whisker, where a scene has more than are looked at in each step."""
-
-    shape: PerListedInt
-    """In the order of the scene."""
-    distance: PerListed1
-    """Bound of the distance from the whisker's axis when they were listed."""
-    count: wp.int32
-    """0: there is no list; all shapes are looked at."""
-    room: real
-    """Least distance of all others from the whisker's axis then."""
-    moved: real
-    """How much nearer any of them may have come since."""
 
 
 @wp.struct
@@ -261,16 +244,19 @@ def query_distances(
 
 @wp.func(inline=True)
 def candidate_slot(
-    candidates: wp.ref[ContactCandidates], count: int, point: vec3, normal: vec3, ahead: real, link: vec3
+    candidates: wp.ref[ContactCandidates], count: int, point: vec3, normal: vec3, ahead: real, near: real
 ) -> int:
-    """Return where to keep a candidate (``count``: a further one; −1: nowhere)."""
+    """Return where to keep a candidate (``count``: a further one; −1: nowhere).
+
+    The same contact may be seen from two links, or from both ends of a short gap: its places are no further apart than
+    the square root of ``near``.
+    """
     slot = count
-    # The same contact seen from two links, or from both ends of a short gap.
     for j in range(count):
-        # Normals within 32° and places within a quarter of the link.
+        # Normals within 32°.
         apart = wp.length_sq(row(candidates.point, j) - point)
         same = wp.dot(row(candidates.normal, j), normal) > real(0.85)
-        if same and apart < real(0.0625) * wp.length_sq(link):
+        if same and apart < near:
             slot = j
     if wp.static(recorded):
         # By how much one of two links is nearer to what both touch.
@@ -423,7 +409,9 @@ def find_candidates(
                         gap = found.end_gap
                         way = found.end_normal
                     if offered == 1 and gap < margin:
-                        deepest = wp.max(deepest, -gap)
+                        # Across an edge the way out is longer than the depth.
+                        if wp.static(not smooth) or which == 1 or found.depth == zero:
+                            deepest = wp.max(deepest, -gap)
                         normal = rotate(body.quaternion, rotate(local_quaternion, way))
                         radius = taper.start_radius + (taper.end_radius - taper.start_radius) * share
                         # The force acts on the skin of the whisker: its radius is the lever of friction.
@@ -446,7 +434,12 @@ def find_candidates(
                         if gap + real(1.5) * job.longest_step * wp.min(approach, zero) <= real(wp.static(CLOSED)):
                             state.closes = 1
                             state.closing_speed = wp.max(state.closing_speed, scene.shapes.speed[s])
-                        slot = candidate_slot(candidates, count, point, normal, ahead, link)
+                        # Within a quarter of the link.
+                        near_here = real(0.0625) * wp.length_sq(link)
+                        if wp.static(smooth):
+                            # What touches beyond a joint that bends much holds the soft link behind it.
+                            near_here = near_here * linearity(rod.near_turn)
+                        slot = candidate_slot(candidates, count, point, normal, ahead, near_here)
                         if slot == count:
                             count = count + 1
                         if slot >= 0:

@@ -263,9 +263,12 @@ def gauss_seidel_sweep(
             found = solve_single_contact(block, bn, b1, b2, p0, q0, row(own.friction, k), solver.tolerance, tries)
             if found[3] > zero:
                 solver.slip_missed = 1
+            overlap = zero
             # No force below LARGEST_FORCE keeps it closed: without this, zero forces would count as solved.
             if bn < zero and found[0] == zero:
                 force_change += real(wp.static(LARGEST_FORCE))
+                # All of it, however little of it a step undoes.
+                overlap = -row(own.gap, k)
             own.force[3 * k] = found[0]
             own.force[3 * k + 1] = found[1]
             own.force[3 * k + 2] = found[2]
@@ -277,7 +280,7 @@ def gauss_seidel_sweep(
             if n0 == zero:
                 missed = wp.min(missed, zero)
             slipped = block[3] * wp.abs(d1) + block[5] * wp.abs(d2)
-            gap_error = wp.max(gap_error, solver.step * (wp.abs(missed) + slipped))
+            gap_error = wp.max(gap_error, wp.max(overlap, solver.step * (wp.abs(missed) + slipped)))
             force_change += wp.abs(d0) + wp.abs(d1) + wp.abs(d2)
             force_sum += found[0]
         # Every contact learns what this change does to its rates.
@@ -502,6 +505,18 @@ def store_forces(problems: ContactProblems, solver: wp.ref[SolverState], own: wp
     moment = vec3(zero, zero, zero)
     normal_sum = zero
     arc_sum = zero
+    if wp.static(smooth):
+        # Contacts that come of one share its means: otherwise it would bend the rod twice.
+        for e in range(warp_max(solver.previous_contacts)):
+            heirs = zero
+            for k in range(solver.own_count):
+                if solver.thread + k < solver.contacts and row(own.origin, k) == e:
+                    heirs = heirs + real(1.0)
+            heirs = group_sum(heirs)
+            for k in range(solver.own_count):
+                if solver.thread + k < solver.contacts and row(own.origin, k) == e:
+                    own.mean[k] = row(own.mean, k) / heirs
+                    own.steady[k] = row(own.steady, k) / heirs
     for k in range(solver.own_count):
         if solver.thread + k < solver.contacts and solver.live == 1:
             force_k = contact_force(own, k)

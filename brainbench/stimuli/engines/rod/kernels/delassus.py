@@ -10,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import CLOSED, CREVICE, PRESSED
+from brainbench.stimuli.engines.rod.limits import CLOSED, CREVICE, PRESSED, UNDONE
 
 from .algebra import JointVector, Spatial, inertia_times, minus, plus, reader, spatial, vec3, vec6
 from .articulated_body import acceleration_over_joint, force_over_joint, inverse_times
@@ -46,6 +46,7 @@ class ThreadContacts:
     arc: PerContact1
     closing_rate: PerContact1
     """Rate that just closes the gap within the step (negative gap over the step)."""
+    gap: PerContact1
     friction: PerContact1
     point: PerContact3
     axis: PerRow3
@@ -61,6 +62,8 @@ class ThreadContacts:
     if smooth:
         mean: PerContact3
         steady: PerContact3
+        origin: PerContactInt
+        """Contact of the last step whose mean forces it takes over; −1: none."""
 
 
 @wp.struct
@@ -135,8 +138,11 @@ def add_contact(problems: ContactProblems, solver: wp.ref[SolverState], own: wp.
     own.arc[k] = candidate.arc
     own.friction[k] = candidate.friction
     own.point[k] = candidate.point
+    own.gap[k] = candidate.gap
     # A deep overlap is undone over several steps.
     own.closing_rate[k] = wp.min(-candidate.gap, real(wp.static(CREVICE[smooth]))) / solver.step
+    if wp.static(smooth):
+        own.closing_rate[k] = wp.min(own.closing_rate[k], real(wp.static(UNDONE)))
     own.axis[3 * k] = normal
     own.axis[3 * k + 1] = tangent
     own.axis[3 * k + 2] = wp.cross(normal, tangent)
@@ -146,13 +152,18 @@ def add_contact(problems: ContactProblems, solver: wp.ref[SolverState], own: wp.
     if wp.static(smooth):
         own.mean[k] = guess
         own.steady[k] = guess
+        own.origin[k] = -1
+    closest = real(0.3) * candidate.link_arc
     for e in range(solver.previous_contacts):
         held = problems.held[index, e]
-        if wp.abs(held.arc - candidate.arc) < real(0.3) * candidate.link_arc:
+        apart = wp.abs(held.arc - candidate.arc)
+        if apart < closest:
             guess = held.force
             if wp.static(smooth):
+                closest = apart
                 own.mean[k] = held.mean
                 own.steady[k] = held.steady
+                own.origin[k] = e
     for a in range(3):
         own.free_rate[3 * k + a] = wp.dot(row(own.axis, 3 * k + a), candidate.free_velocity)
         own.force[3 * k + a] = wp.dot(guess, row(own.axis, 3 * k + a))

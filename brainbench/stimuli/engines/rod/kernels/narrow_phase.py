@@ -211,6 +211,8 @@ def link_shape_distance(
         low = real(0.0)
         high = real(1.0)
         deepest = real(wp.static(-beyond))
+        falling = vec3()
+        rising = vec3()
         while warp_max(int(phase != DONE)) == 1:
             got = nearest_triangles(shapes, s, a, b, farthest, within, first_leaf - 1, part, int(phase != DONE))
             triangle = shapes.face[s] + got.end_face
@@ -248,17 +250,26 @@ def link_shape_distance(
                         phase = wp.static(DEEPEST if smooth else DONE)
                 else:
                     normal = vec3(out[0], out[1], out[2])
-                    if wp.dot(normal, line_tangent(link, share)) > rb - ra:
+                    slope = wp.dot(normal, line_tangent(link, share)) - (rb - ra)
+                    if slope > real(0.0):
                         high = share
+                        falling = normal / slope
                     else:
                         low = share
+                        rising = normal / wp.min(slope, real(-1e-12))
                     # Differences of simulations see the last of few halvings.
                     if measured == wp.static(halvings if recorded else DEPTH_HALVINGS):
                         if low == real(0.0):
                             share = real(0.0)
                         if high == real(1.0):
                             share = real(1.0)
-                        touch_between(found, vec5(share, -depth, out[0], out[1], out[2]), triangle)
+                        # Between two faces the way out is across the line and their edge.
+                        across = (falling - rising) / (wp.length(falling) + wp.length(rising))
+                        part_out = wp.length(across)
+                        if part_out > real(0.5):
+                            normal = across / part_out
+                            depth = here - out[3] / part_out
+                        touch_between(found, vec5(share, -depth, normal[0], normal[1], normal[2]), triangle)
                         phase = int(DONE)
             if wp.static(smooth):
                 if phase == NEARER:

@@ -358,6 +358,22 @@ class ResultArrays:
 
 
 @wp.struct
+class NearShapes:
+    """The shapes nearest to a whisker, where a scene has more than are looked at in each step."""
+
+    shape: PerListedInt
+    """In the order of the scene."""
+    distance: PerListed1
+    """Bound of the distance from the whisker's axis when they were listed."""
+    count: wp.int32
+    """0: there is no list; all shapes are looked at."""
+    room: real
+    """Least distance of all others from the whisker's axis then."""
+    moved: real
+    """How much nearer any of them may have come since."""
+
+
+@wp.struct
 class ContactCandidates:
     """Places where contact is possible within one step."""
 

@@ -22,7 +22,6 @@ from .articulated_body import (
     yield_base,
 )
 from .broad_phase import (
-    NearShapes,
     check_rest,
     count_near_links,
     find_candidates,
@@ -48,6 +47,7 @@ from .state import (
     Instant,
     JobArrays,
     MotionArrays,
+    NearShapes,
     PausedWhiskers,
     ReadingArrays,
     ResultArrays,
