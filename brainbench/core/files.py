@@ -307,8 +307,6 @@ def to_plain(value: Any) -> Any:
         plain: Any = as_list()
         # A long double has no type of its own in Python and gives itself.
         return to_plain(float(plain) if type(plain) is type(value) else plain)
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
     return value
 
 

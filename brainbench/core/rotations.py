@@ -58,11 +58,8 @@ def from_rpy(angles: ArrayLike) -> NDArray[np.float64]:
 
 def euler_matrix(angles: ArrayLike) -> NDArray[np.float64]:
     """Return the rotation matrix [3, 3] of turns about the fixed x, then y, then z axis by ``angles`` [3] (rad)."""
-    (cx, cy, cz), (sx, sy, sz) = np.cos(angles), np.sin(angles)
-    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
-    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
-    about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-    return about_z @ about_y @ about_x
+    x, y, z = np.asarray(angles, dtype=np.float64)
+    return _about("z", z) @ _about("y", y) @ _about("x", x)
 
 
 def base_rotation(euler: ArrayLike) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypeGuard
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import DataError, UsageError, check_number
+from brainbench.core.errors import DataError, UsageError
 from brainbench.core.lazy import lazy_module
 from brainbench.core.records import Interval, Score
 
@@ -74,21 +74,18 @@ def error_of_spreads(
     return np.where(usable, np.sqrt(total), np.nan), np.where(usable, freedom, np.nan)
 
 
-def two_factor_interval(
-    value: float, animals: ArrayLike, without_stimulus: ArrayLike, level: float = LEVEL
-) -> Interval | None:
+def two_factor_interval(value: float, animals: ArrayLike, without_stimulus: ArrayLike) -> Interval | None:
     """Return the t interval of a mean over animals and stimuli; None for fewer than two of either.
 
     ``animals`` [A] are the values of single animals, ``without_stimulus`` [K] the mean without each stimulus in turn.
     """
-    check_level(level)
     error, freedom = (float(found) for found in two_factor_error(animals, without_stimulus))
     if not math.isfinite(error):
         return None
-    half = float(special.stdtrit(freedom, (1 + level) / 2)) * error if error > 0 else 0.0
+    half = float(special.stdtrit(freedom, (1 + LEVEL) / 2)) * error if error > 0 else 0.0
     count, stimuli = (np.isfinite(np.asarray(part, dtype=np.float64)).sum() for part in (animals, without_stimulus))
     what = f"t over {count} animals and {stimuli} stimuli (jackknife)"
-    return Interval(value - half, value + half, level, what)
+    return Interval(value - half, value + half, LEVEL, what)
 
 
 def _spread(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -115,33 +112,42 @@ def wilson_interval(successes: float, count: int, *, over: str = "trials", level
     return Interval(low, high, level, f"Wilson score over {count} {over}")
 
 
-CONFOUNDED = 0.1
-"""Share of the variance of trial times, beyond that of shuffled labels, from which label and time are confounded."""
-_CONFOUNDED_P = 1e-4  # recordings have up to some hundred sessions, of which none may be suspected by chance
+_CONFOUNDED, _CONFOUNDED_BY_WAVES = (0.1, 1e-4), (0.5, 1e-7)
+"""Share of the variance of trial times, or of a slow wave, beyond that of shuffled labels, from which label and time
+are confounded, and its largest p: of some hundred sessions none may be suspected by chance. Runs in changing order
+explain a quarter of a wave and more, and the F test takes its values, of which many are equal, for more."""
+_WAVES, _SLOW = 8, 6  # most half waves of slow changes in a session, and fewest trials of each
 
 
 @dataclass(frozen=True)
 class PresentationOrder:
-    """How much of the variance of the times (ranks) of a session's trials their label explains."""
+    """How much of the variance of the times (ranks) of a session's trials, or of a slow wave, their label explains."""
 
     share: float
     expected: float
     """The same of shuffled labels, mean."""
     p: float
     """Of a share as large for shuffled labels (F test of ranks)."""
+    waves: int = 0
+    """Half waves over the session; 0 for the times themselves."""
 
     @property
     def confounded(self) -> bool:
         """True where slow changes over the session tell labels apart without any tuning."""
-        return self.p <= _CONFOUNDED_P and self.share - self.expected >= CONFOUNDED * (1 - self.expected)
+        least, level = _CONFOUNDED_BY_WAVES if self.waves else _CONFOUNDED
+        return self.p <= level and self.share - self.expected >= least * (1 - self.expected)
 
     def __str__(self) -> str:
         share, expected = round(100 * self.share), round(100 * self.expected)
-        return f"the label explains {share} % of the variance of trial times ({expected} % if shuffled)"
+        what = f"slow changes ({self.waves} half waves over the session)" if self.waves else "trial times"
+        return f"the label explains {share} % of the variance of {what} ({expected} % if shuffled)"
 
 
 def presentation_order(times: ArrayLike, labels: ArrayLike) -> PresentationOrder | None:
     """Return what labels [R] explain of the times [R] of a session's trials; None below three labels of two trials.
+
+    Blocks that come again in the same or the reverse order have much the same mean times: where labels are confounded
+    with a slow wave instead, it is what they explain of that.
 
     >>> presentation_order([1, 2, 3, 4, 5, 6, 7, 8, 9], list("aaabbbccc")).share
     0.9
@@ -151,23 +157,26 @@ def presentation_order(times: ArrayLike, labels: ArrayLike) -> PresentationOrder
     counts = np.bincount(codes)
     if len(names) < 3 or counts.min() < 2 or not np.isfinite(order).all() or not np.ptp(order):
         return None
+    between, within, orders = len(names) - 1, len(order) - len(names), []
+    for waves, course in slow_courses(order).items():
+        course = course - course.mean()
+        share = float((np.bincount(codes, weights=course) ** 2 / counts).sum() / (course**2).sum())
+        p = float(special.fdtrc(between, within, share / max(1 - share, 1e-300) * within / between))
+        orders.append(PresentationOrder(share, between / (between + within), p, waves))
+    return max(orders, key=lambda each: (each.confounded, each.share if each.confounded else -each.waves))
+
+
+def slow_courses(times: NDArray[np.float64]) -> dict[int, NDArray[np.float64]]:
+    """Return the ranks of the times [R] of trials and, by their number of half waves, slow waves over the session."""
     # Trials that begin together have the mean of their ranks.
-    ranks = stats.rankdata(order)
-    ranks = ranks - ranks.mean()
-    share = float((np.bincount(codes, weights=ranks) ** 2 / counts).sum() / (ranks**2).sum())
-    between, within = len(names) - 1, len(order) - len(names)
-    p = float(special.fdtrc(between, within, share / max(1 - share, 1e-300) * within / between))
-    return PresentationOrder(share, between / (between + within), p)
+    ranks = stats.rankdata(times)
+    waves = range(2, min(_WAVES, len(ranks) // _SLOW) + 1)
+    return {0: ranks} | {number: np.cos(np.pi * number * (ranks - 0.5) / len(ranks)) for number in waves}
 
 
 def is_finite(interval: Interval | None) -> TypeGuard[Interval]:
     """Return whether there is an interval and both its ends are numbers."""
     return interval is not None and math.isfinite(interval.low) and math.isfinite(interval.high)
-
-
-def check_level(level: float) -> None:
-    """Raise UsageError unless a confidence level lies between 0 and 1."""
-    check_number("confidence level", level, above=0, below=1)
 
 
 @dataclass(frozen=True)

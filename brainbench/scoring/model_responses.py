@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -156,12 +157,13 @@ class ResolvedModel:
             if card.objective not in (None, "untrained") and (difference := _unlike_training(self.module, simulated)):
                 _LOG.warning("%s was trained on other stimuli: here %s.", card.name, difference)
                 note += f"; unlike its training: {difference}"
+            averaged = partial(np.mean, axis=1, keepdims=True, dtype=np.float64)
             activations = extract(
                 self.module,
                 values,
                 layers=options.layers,
                 readout=options.readout,
-                reduce=mean_over_time if options.time == "mean" and not options.over_time else None,
+                reduce=averaged if options.time == "mean" and not options.over_time else None,
                 memory=options.memory,
             )
             if options.readout == "default" and not is_ours(self.module):
@@ -325,11 +327,6 @@ def _unlike_training(module: Any, stimuli: Stimuli) -> str:
     if not spec.frame.startswith(axes):
         differences.append(f"{axes} axes, there {spec.frame.partition(' ')[0]} axes")
     return " and ".join(differences)
-
-
-def mean_over_time(values: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return the mean [K, 1, F] of activations [K, T, F]."""
-    return values.mean(axis=1, keepdims=True, dtype=np.float64)
 
 
 def reduce_time(values: NDArray[np.floating], time: str) -> NDArray[np.floating]:

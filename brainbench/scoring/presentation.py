@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.records import Score
-from brainbench.core.statistics import PresentationOrder, presentation_order
+from brainbench.core.statistics import PresentationOrder, presentation_order, slow_courses
 
 if TYPE_CHECKING:
     from brainbench.metrics import Metric
@@ -124,15 +124,19 @@ def _control(metric: Metric, animals: Sequence[SubjectRDM], labels: Sequence[str
         if not animal.presented:
             return None
         places = [_mean_places(*trials, len(labels)) for trials in animal.presented.values()]
-        layers[animal.subject] = metric.layer(np.stack(places, axis=1))
+        layers[animal.subject] = metric.layer(np.concatenate(places, axis=1))
     how: dict[str, Any] = {"stimuli": labels, "seed": seed, "each": True}
     return score_layers(metric, layers, animals, name=CONTROL, **how)[0] if layers else None
 
 
 def _mean_places(start: NDArray[Any], codes: NDArray[Any], count: int) -> NDArray[np.float64]:
-    """Return the mean place [K] of each stimulus' trials in their session, from 0 to 1."""
-    from scipy.stats import rankdata
+    """Return the mean place [K, 1 + W] of each stimulus' trials in their session, from 0 to 1.
 
-    # Trials that begin together have one place: the order in which they are listed is that of their labels.
-    places = (rankdata(start) - 1) / max(1, len(start) - 1)
-    return np.bincount(codes, weights=places, minlength=count) / np.bincount(codes, minlength=count)
+    Where labels are confounded with slow waves instead, their means follow, of the size that each has in a random walk.
+    """
+    (_, ranks), *courses = slow_courses(start).items()
+    columns, order = [(ranks - 1) / max(1, len(start) - 1)], presentation_order(start, codes)
+    if order is not None and order.waves:
+        columns += [course * math.sqrt(2) / (math.pi * waves) for waves, course in courses]
+    sums = [np.bincount(codes, weights=column, minlength=count) for column in columns]
+    return np.stack(sums, axis=1) / np.bincount(codes, minlength=count)[:, None]

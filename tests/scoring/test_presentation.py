@@ -15,10 +15,11 @@ STIMULI, TRIALS, UNITS = 12, 8, 30
 NAMES = tuple(f"s{index:02d}" for index in range(STIMULI))
 
 
-def _make_recordings(*, blocked, tuning=0.0, animals=4, times=True, blocks=1, turn=0.0):
+def _make_recordings(*, blocked, tuning=0.0, animals=4, times=True, blocks=1, turn=0.0, steps=()):
     """Counts of neurons whose rates drift over the session, tuned to a shared geometry by ``tuning``.
 
-    Each stimulus has ``blocks`` runs of trials; by the end of the session the tuning is to another geometry, by
+    Each stimulus has ``blocks`` runs of trials in changing order, or one run in each of the orders that ``steps`` say:
+    1 for that of the stimuli, −1 for the reverse. By the end of the session the tuning is to another geometry, by
     ``turn`` of a right angle.
     """
     rng, parts = np.random.default_rng(0), []
@@ -26,9 +27,10 @@ def _make_recordings(*, blocked, tuning=0.0, animals=4, times=True, blocks=1, tu
     counts = np.full((animals, STIMULI * TRIALS, 1, animals * UNITS), np.nan)
     for animal in range(animals):
         labels = np.repeat(np.arange(STIMULI), TRIALS)
-        if blocks > 1:
+        if blocks > 1 or steps:
             runs = [np.random.default_rng(place).permutation(STIMULI) for place in range(blocks)]
-            labels = np.repeat(np.concatenate(runs), TRIALS // blocks)
+            runs = [np.arange(STIMULI)[::step] for step in steps] or runs
+            labels = np.repeat(np.concatenate(runs), TRIALS // len(runs))
         labels = labels if blocked else rng.permutation(labels)
         time = np.linspace(-1, 1, len(labels))[:, None]
         drift = 0.35 * np.concatenate([time, time**2], axis=1) @ rng.normal(size=(2, UNITS))
@@ -87,6 +89,11 @@ def test_the_label_explains_the_times_of_blocks_and_nothing_of_interleaved_trial
     # One of each label in every block of eight explains less than chance.
     assert not presentation_order(times, np.tile(np.arange(8), 10)).confounded
     assert presentation_order(times, np.tile([0, 1], 40)) is None
+    for steps in [(1, -1), (1, 1), (1, 1, 1, 1), (1, -1, 1, -1)]:
+        again = np.concatenate([np.repeat(np.arange(8)[::step], 20 // len(steps)) for step in steps])
+        order = presentation_order(np.arange(160.0), again)
+        assert (order.waves, order.confounded) == (2 * len(steps) // (1 + (-1 in steps)), True)
+        assert f"slow changes ({order.waves} half waves over the session)" in str(order)
 
 
 def test_the_clock_scores_in_blocks_under_drift_and_is_not_believed(tmp_path):
@@ -97,6 +104,30 @@ def test_the_clock_scores_in_blocks_under_drift_and_is_not_believed(tmp_path):
     assert "confounded in 4 of 4 sessions" in record.score.reasons[0]
     assert record.baselines[CONTROL].scaled > 0.7
     assert record.score.provenance.statistics["presentation"]["confounded"] == 4
+
+
+@pytest.mark.parametrize("steps", [(1, -1), (1, 1, 1, 1)])
+def test_blocks_that_come_again_in_one_order_or_the_reverse_are_not_believed(tmp_path, steps):
+    # The mean times of all stimuli are then equal, or nearly so, and parts by time agree: drift repeats its geometry.
+    recordings, _ = _make_recordings(blocked=True, steps=steps)
+    record = _score(tmp_path, _rank(), recordings)
+    assert record.score.p <= 0.01
+    assert record.score.scaled > 0.3
+    assert record.score.status == "unreliable"
+    assert "confounded in 4 of 4 sessions" in record.score.reasons[0]
+    assert record.baselines[CONTROL].scaled > 0.3
+
+
+def test_tuned_neurons_in_repeated_blocks_are_believed_where_slow_waves_explain_nothing(tmp_path):
+    recordings, geometry = _make_recordings(blocked=False, tuning=0.2)
+    order = np.tile(np.concatenate([np.repeat(np.arange(STIMULI)[::step], TRIALS // 2) for step in (1, -1)]), 4)
+    labels, times = recordings["stimulus"].values.reshape(4, -1), np.empty(4 * STIMULI * TRIALS)
+    for animal, place in enumerate(times.reshape(4, -1)):
+        place[np.argsort(labels[animal], kind="stable")] = np.argsort(order[: place.size], kind="stable")
+    record = _score(tmp_path, geometry, recordings.assign_coords(window_start=("trial", times)))
+    assert record.score.provenance.statistics["presentation"]["confounded"] == 4
+    assert record.baselines[CONTROL].p > 0.05
+    assert record.score.status == "ok"
 
 
 def test_tuned_neurons_in_an_interleaved_session_are_believed(tmp_path):

@@ -120,11 +120,15 @@ class _Fold:
     stimulus: int
     train: Floats  # [R′, D] rows in the span of the training rows, which is all that a penalised fit can use
     test: Floats
+    weights: Floats  # [R′] of the rows, the same sum for every stimulus
 
 
 def _fold(matrix: Floats, rows: Ints, stimulus: int) -> _Fold:
     inside = rows != stimulus
     train, test = matrix[inside], matrix[~inside]
+    # Each stimulus counts alike: else the class whose stimuli have the most trials is told wherever nothing is known.
+    numbers = np.bincount(rows)[rows[inside]]
+    weights = len(numbers) / rows.max() / numbers
     mean = train.mean(axis=0)
     # The left-out stimulus takes no part in mean and scale, or the test would leak into the training.
     train, test = train - mean, test - mean
@@ -134,22 +138,23 @@ def _fold(matrix: Floats, rows: Ints, stimulus: int) -> _Fold:
         # Coordinates in the span of the training rows: a penalised fit gives no weight to what is orthogonal to them.
         basis = np.linalg.svd(train, full_matrices=False)[2]
         train, test = train @ basis.T, test @ basis.T
-    return _Fold(stimulus, train / scale, test / scale)
+    return _Fold(stimulus, train / scale, test / scale, weights)
 
 
 def _correct(fold: _Fold, codes: Ints, rows: Ints, penalty: float) -> float:
     target = codes[rows[rows != fold.stimulus]]
-    weight, bias = fit_softmax(fold.train, target, int(codes.max()) + 1, penalty)
+    weight, bias = fit_softmax(fold.train, target, int(codes.max()) + 1, penalty, fold.weights)
     return float((np.argmax(fold.test @ weight + bias, axis=1) == codes[fold.stimulus]).mean())
 
 
-def fit_softmax(features: Floats, target: Ints, classes: int, penalty: float) -> tuple[Floats, Floats]:
-    """Return weights [D, C] and biases [C] of multinomial logistic regression, Σ loss + ‖w‖²/2C, bias free."""
+def fit_softmax(features: Floats, target: Ints, classes: int, penalty: float, counts: Any = 1) -> tuple[Floats, Floats]:
+    """Return weights [D, C], biases [C] of multinomial logistic regression, Σ counts · loss + ‖w‖²/2C, bias free."""
     from scipy.optimize import minimize
     from scipy.special import log_softmax
 
     width = features.shape[1]
     wanted = np.eye(classes, dtype=bool)[target]
+    rows = np.broadcast_to(counts, len(target))
 
     def loss(flat: Floats) -> tuple[float, Floats]:
         """Return the loss and its gradient [(D + 1) C] at weights and biases in one row."""
@@ -157,8 +162,8 @@ def fit_softmax(features: Floats, target: Ints, classes: int, penalty: float) ->
         weight, bias = both[:-1], both[-1]
         log_p = log_softmax(features @ weight + bias, axis=1)
         # Gradient Xᵀ(softmax − wanted) + w/C; the logarithm of the softmax stays finite for large scores.
-        rest = np.exp(log_p) - wanted
-        value = float(-log_p[wanted].sum() + (weight**2).sum() / (2 * penalty))
+        rest = (np.exp(log_p) - wanted) * rows[:, None]
+        value = float(-(log_p[wanted] * rows).sum() + (weight**2).sum() / (2 * penalty))
         gradient = np.concatenate([features.T @ rest + weight / penalty, rest.sum(axis=0, keepdims=True)])
         return value, gradient.ravel()
 
@@ -214,8 +219,7 @@ class LabelDecoding(Metric):
 
     name = "decoding"
     title = "accuracy of logistic regression for properties of stimuli left out, mean over properties"
-    orders = 199
-    orders_between = 199
+    orders = orders_between = ORDERS
     of_model_alone = True
     reasons = ("accuracy of the model alone, no likeness: the animals' own stands beside it",)
 
@@ -257,8 +261,7 @@ class LabelDecoding(Metric):
         """Return the accuracy of every property."""
         if not self.defined(layer).all():
             return {}
-        exact = most_exact(self.orders)
-        orders = np.concatenate(list(label_orders(len(layer.features), seed, exact=exact, draws=self.orders)))
+        orders = np.concatenate(list(label_orders(len(layer.features), seed, exact=most_exact(ORDERS), draws=ORDERS)))
         values = np.stack([layer.right(order).mean(axis=1) for order in orders])
         accuracies = [
             {

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from brainbench.core import rotations
 from brainbench.core.errors import UsageError, check_each, check_number, unknown_name
 from brainbench.core.limits import Count, Limit, Positive, limited
-from brainbench.core.statistics import check_level
 from brainbench.stimuli.engines.fidelity import MOST_LINKS
 from brainbench.stimuli.motion.jobs import Follicle, Job
 from brainbench.stimuli.objects.obstacle import Obstacle
@@ -300,7 +299,7 @@ class FitOptions:
                 f"Profile intervals follow the squares of the residuals, and the loss {self.loss!r} is another; "
                 "use intervals = 'laplace', or the loss 'linear'."
             )
-        check_level(self.level)
+        check_number("confidence level", self.level, above=0, below=1)
 
 
 @dataclass(frozen=True)

@@ -54,6 +54,24 @@ def test_without_information_leaving_one_out_falls_below_chance():
     )
 
 
+def test_classes_of_stimuli_with_more_trials_are_not_decoded_from_noise():
+    # Where nothing is known, the class of most trials was told: right for all its stimuli, and for fewer in any other
+    # order of the classes, so .45 of such data had p ≤ .05.
+    rng, stimuli = np.random.default_rng(4), np.repeat(np.arange(8), [20] * 4 + [4] * 4)
+    results = [decode(rng.normal(size=(96, 2)), stimuli, ["a"] * 4 + ["b"] * 4) for _ in range(16)]
+    assert np.mean([result.p for result in results]) > 0.3
+    assert sum(result.p <= 0.05 for result in results) <= 3
+
+
+def test_trials_that_stand_several_times_for_each_stimulus_change_no_fit():
+    rng = np.random.default_rng(6)
+    features, target = rng.normal(size=(20, 4)), rng.integers(0, 3, 20)
+    numbers = rng.integers(1, 5, 20)
+    repeated = fit_softmax(np.repeat(features, numbers, axis=0), np.repeat(target, numbers), 3, penalty=0.7)
+    counted = fit_softmax(features, target, 3, penalty=0.7, counts=numbers)
+    np.testing.assert_allclose(features @ counted[0] + counted[1], features @ repeated[0] + repeated[1], atol=1e-3)
+
+
 def test_all_orders_of_the_classes_are_tried_up_to_six_stimuli():
     trials = np.random.default_rng(5).normal(size=(8, 4))
     assert decode(trials[:6], range(6), SHAPES).count == 720
