@@ -84,8 +84,7 @@ def two_factor_interval(value: float, animals: ArrayLike, without_stimulus: Arra
         return None
     half = float(special.stdtrit(freedom, (1 + LEVEL) / 2)) * error if error > 0 else 0.0
     count, stimuli = (np.isfinite(np.asarray(part, dtype=np.float64)).sum() for part in (animals, without_stimulus))
-    what = f"t over {count} animals and {stimuli} stimuli (jackknife)"
-    return Interval(value - half, value + half, LEVEL, what)
+    return Interval(value - half, value + half, LEVEL, f"t over {count} animals and {stimuli} stimuli (jackknife)")
 
 
 def _spread(values: NDArray[np.float64]) -> NDArray[np.float64]:

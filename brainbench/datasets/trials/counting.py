@@ -74,6 +74,7 @@ OTHER_NAMES = {
 
 _TRUTH = {"true": 1.0, "false": 0.0}
 _MOST_COUNTS = 1 << 32  # counts of one session that are made at most: 16 GiB
+_INSIDE = np.array([1e-6, -1e-6])  # s from a window's ends to where it may touch what lies beside it: sums are rounded
 
 
 @dataclass(frozen=True)
@@ -223,7 +224,8 @@ def _windows(
         begin, end = invalid.times("start_time"), invalid.times("stop_time")
         if wrong := int((~(end >= begin)).sum()):
             raise DataError(f"{wrong} of {len(end)} rows of {invalid.label} end before they begin, or at no time.")
-        overlap = np.any([((part[:, :1] < end) & (part[:, 1:] > begin)).any(axis=1) for part in parts], axis=0)
+        inner = np.add(parts, _INSIDE)
+        overlap = ((inner[..., :1] < end) & (inner[..., 1:] > begin)).any(axis=(0, 2))
         keep = ledger.apply(keep, ~overlap, "trials", "overlap with invalid_times")
     return keep, parts
 
@@ -264,7 +266,7 @@ class SpikeTrains:
 
     def covered(self, edges: NDArray[np.float64], ledger: Ledger) -> NDArray[np.bool_]:
         """Return which windows [R, 2] (s) lie in observed spans, else between first and last spike: [R, U]."""
-        if (observed := inside_observed_spans(self.units, edges)) is not None:
+        if (observed := inside_observed_spans(self.units, edges := edges + _INSIDE)) is not None:
             return observed
         covered = np.zeros((len(edges), len(self.spikes)), dtype=bool)
         if (span := recorded_span(self.spikes)) is not None:
@@ -490,7 +492,7 @@ def merged(spans: NDArray[np.float64]) -> list[tuple[float, float]]:
     # What ends before it begins, or at no known time, holds nothing; NaN would also undo the order.
     for low, high in sorted(map(tuple, spans[spans[:, 0] <= spans[:, 1]].tolist())):
         # Spans that touch are one recording: a window across their common end lies inside it.
-        if merged and low <= merged[-1][1]:
+        if merged and low <= merged[-1][1] + _INSIDE[0]:
             merged[-1] = (merged[-1][0], max(high, merged[-1][1]))
         else:
             merged.append((low, high))

@@ -143,10 +143,11 @@ class Samples:
                 "take longer ones."
             )
         means = np.full((*duration.shape, len(units)), np.nan, dtype=np.float32)
+        # A frame on a bound up to rounding, a thousandth of the way to the next, belongs to the later bin.
+        edges = bounds - 1e-3 * np.nan_to_num(self.step) - (0.0 if self.starts is None else self.starts[rows, None])
         for index, row in enumerate(rows):
-            begin = 0.0 if self.starts is None else self.starts[row]
-            times, values = self._read(int(row), units, *(bounds[index, [0, -1]] - begin))
-            place = np.searchsorted(times, bounds[index] - begin, side="left")
+            times, values = self._read(int(row), units, *edges[index, [0, -1]])
+            place = np.searchsorted(times, edges[index], side="left")
             if math.isnan(self.step):
                 place = np.array([0, 1])
             for column in range(duration.shape[1]):

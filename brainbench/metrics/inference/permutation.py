@@ -189,11 +189,10 @@ def label_orders(
     yield np.arange(stimuli)[None]
     # One seeded stream, drawn row by row: chunks of any size give the same orders.
     generator = np.random.default_rng(seed)
-    left = RANDOM_PERMUTATIONS if draws is None else draws
-    while left:
-        rows = min(step, left)
+    number = RANDOM_PERMUTATIONS if draws is None else draws
+    for start in range(0, number, step):
+        rows = min(step, number - start)
         yield generator.permuted(np.tile(np.arange(stimuli), (rows, 1)), axis=1)
-        left -= rows
 
 
 def canonical_order(brain: Floats) -> Ints:

@@ -187,9 +187,8 @@ def usable_sessions(
         trials = np.bincount(codes, minlength=count)
         total += trials
         if trials.min() < least:
-            few = [f"{names[k]} ({trials[k]})" for k in np.flatnonzero(trials < least)]
-            others = " and others" if len(few) > 4 else ""
-            lacking.append(f"fewer than {least} trials of {', '.join(few[:4])}{others}")
+            few = listing((f"{names[k]} ({trials[k]})" for k in np.flatnonzero(trials < least)), limit=4, quoted=False)
+            lacking.append(f"fewer than {least} trials of {few}")
             continue
         # Both halves need recorded trials of every stimulus in each unit that is kept.
         groups = [codes == stimulus for stimulus in range(count)]

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from brainbench.core.errors import UsageError
 from brainbench.datasets import export, open_recordings, write_recordings
 from brainbench.datasets.sessions import SessionTable, make_session
-from brainbench.datasets.trials.counting import SpikeTrains, bin_bounds, mask_missing
+from brainbench.datasets.trials.counting import SpikeTrains, bin_bounds, mask_missing, merged
 from brainbench.datasets.trials.session_trials import trials_by_subject
 
 
@@ -96,6 +96,20 @@ def test_units_that_were_not_recorded_are_missing():
     counts, _ = count([np.zeros(1)] * 2, np.array([[0.0, 1.0]]), np.array([[True, False]]), None)
     assert counts[0, 0, 0] == 1
     assert np.isnan(counts[0, 0, 1])
+
+
+def test_windows_may_touch_what_lies_beside_them_however_sums_are_rounded(tmp_path):
+    starts = np.arange(1.0, 9.0)
+    table = {"start_time": starts, "stop_time": starts + 0.5, "stimulus": list("abababab")}
+    # The last digit of a border: stretches to be left out end where trials begin, and the recording with the last.
+    invalid = {"start_time": starts - 0.1, "stop_time": np.nextafter(starts, 10)}
+    spikes = [np.sort(np.random.default_rng(0).uniform(1, 8.5, 200)), np.array([1.0, np.nextafter(8.5, 0)])]
+    path = write_recordings(
+        tmp_path / "a.h5", make_session("m", "1", spikes, {"trials": table, "invalid_times": invalid})
+    )
+    assert open_recordings(path, conditions="trials:stimulus", window="start..stop").sizes["trial"] == 8
+    assert merged(np.array([[0, 0.3], [0.1 + 0.2, 1]])) == [(0, 1)]
+    assert len(merged(np.array([[0, 0.3], [0.301, 1]]))) == 2
 
 
 def test_a_bin_is_positive():

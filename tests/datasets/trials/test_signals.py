@@ -75,6 +75,18 @@ def test_bins_timestamps_and_chosen_cells(tmp_path):
     np.testing.assert_allclose(values[2, :, 0], [data[20:22, 1].mean(), data[22:24, 1].mean()], rtol=1e-5)
 
 
+def test_frames_on_the_bounds_of_bins_are_in_the_later_bin_however_sums_are_rounded(tmp_path):
+    """Bins of one frame: 7 % had none and as many two, since 1 + 7 · (1/30) is not (30 + 7)/30."""
+    data = np.random.default_rng(0).normal(size=(1900, 3))
+    path = write_nwb(tmp_path / "a.nwb", units=False)
+    with h5py.File(path, "a") as file:
+        file["intervals/trials/start_time"][...] = starts = np.array([1, 7, 13, 29, 41, 58])
+        file["intervals/trials/stop_time"][...] = starts + 1
+    _, values = means(imaged(path, data, rate=30.0), window="start..+1", bin=1 / 30)
+    expected = data[30 * starts[:, None] + np.arange(30)]
+    np.testing.assert_allclose(values, expected, rtol=1e-5)
+
+
 @pytest.mark.parametrize("rates", [(20, 20), (20, 60)])
 def test_windows_without_a_tenth_of_their_frames_are_left_out(tmp_path, rates):
     """Trials of .5 s each second; frames are missing from 2.06 to 4.02 s, and one of ten in the first trial."""
