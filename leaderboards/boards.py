@@ -29,6 +29,7 @@ from brainbench.core.files import content_hash
 from brainbench.core.identity import unusual_settings
 from brainbench.core.records import ESTIMATOR_VERSION, Interval, ResultRecord, Score
 from brainbench.core.statistics import LEVEL
+from leaderboards import ranking
 from leaderboards.entries import TOLERANCE, Entry, fold_seeds, moment, same_computation
 from leaderboards.ranking import DOUBTFUL, Sample, apart, differences, lacking, rank_in_print, rank_ranges, told_apart
 from leaderboards.text import number, plural, span
@@ -231,7 +232,9 @@ def conclusions(board: Board) -> list[str]:
         who = f": {_names(above)}" if above else ""
         sentences.append(f"Told apart above {RAW_INPUT}: {len(above)} of {plural(len(tested), 'model')}{who}.")
     if chance := sum(entry.standing == "not told apart from chance" for entry in here):
-        sentences.append(f"Not told apart from chance: {chance} of {plural(len(here), 'model')}.")
+        passing = ranking.CHANCE_LEVEL * len(here)
+        alone = f" Each is tested alone: about {passing:.0f} of as many unrelated ones pass." * (passing >= 1)
+        sentences.append(f"Not told apart from chance: {chance} of {plural(len(here), 'model')}.{alone}")
     if apart := len(board.entries) - len(here):
         sentences.append(
             f"Standing apart because nobody here can compute them again: {plural(apart, 'entry', 'entries')}."

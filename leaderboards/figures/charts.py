@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -172,7 +173,7 @@ def board_figures(board: Board) -> list[svg.Figure]:
         accuracy_against_fit(entries, supervised=True),
         parameters_against_fit(entries),
         parameters_against_accuracy(entries),
-        _ablation("augmentation", title, entries, _augmentation, _any_masking, "augmentation"),
+        _ablation("augmentation", title, entries, _augmentation, partial(_masking, always=False), "augmentation"),
         _ablation("masking", "Temporal masking", entries, _masking, _augmentation, "share of masked steps"),
     ]
 
@@ -325,12 +326,8 @@ def _augmentation(entry: Entry) -> str:
     return (entry.card.augmentation or "").partition(" + ")[0]
 
 
-def _masking(entry: Entry) -> str:
-    return f"{entry.masking:.0%} masked" if entry.trained else ""
-
-
-def _any_masking(entry: Entry) -> str:
-    return _masking(entry) if entry.masking else ""
+def _masking(entry: Entry, *, always: bool = True) -> str:
+    return f"{entry.masking:.0%} masked" if entry.trained and (always or entry.masking) else ""
 
 
 def _twin_points(entry: Entry, untrained: Mapping[str, Entry], size: float) -> tuple[svg.ChartPoint, ...]:

@@ -239,6 +239,13 @@ def test_a_board_of_one_model_and_one_where_nothing_is_above_chance_say_so():
     assert "No model leads" in conclusions(_board(draw_board({"nothing": -0.5, "more": -0.5})))[0]
 
 
+def test_conclusions_of_many_models_say_how_many_pass_the_test_by_chance():
+    many = conclusions(_board(draw_board({f"m{place}": -0.5 for place in range(40)})))
+    assert any("40 of 40 models. Each is tested alone: about 2 of as many" in text for text in many)
+    few = conclusions(_board(draw_board({f"m{place}": -0.5 for place in range(4)})))
+    assert not any("tested alone" in text for text in few)
+
+
 WIDE = {"best": 0.9, "fair": 0.4, "poor": 0.1}
 
 
