@@ -33,9 +33,10 @@ from brainbench.core.runs.folder import begin_run
 from brainbench.core.runs.jobs import run_jobs
 from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, compare_scores, wilson_interval
 from brainbench.datasets.synthetic.populations import PopulationDesign, ResponseGeometry, principal_axes
-from brainbench.metrics.arrays import Floats, Ints
+from brainbench.metrics.arrays import Floats, Ints, finite_mean
 from brainbench.metrics.inference.multiple import adjust
 from brainbench.metrics.measures.metric import Metric, get_metric
+from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE
 from brainbench.metrics.score import score_layers
 from brainbench.scoring.options import ScoreOptions
 
@@ -86,10 +87,8 @@ class Recovery:
 
     def wins(self, candidate: int | None = None) -> Interval:
         """Return Wilson's interval of the share of boards in which the true candidate comes first."""
-        firsts = np.diag(self.firsts)
-        if candidate is None:
-            return wilson_interval(int(firsts.sum()), int(self.counts.sum()), over="boards")
-        return wilson_interval(int(firsts[candidate]), int(self.counts[candidate]), over="boards")
+        rows = slice(None) if candidate is None else candidate
+        return wilson_interval(int(np.diag(self.firsts)[rows].sum()), int(self.counts[rows].sum()), over="boards")
 
     @property
     def win_rate(self) -> float:
@@ -106,8 +105,7 @@ class Recovery:
     @property
     def reliability(self) -> float:
         """Mean split-half reliability of the animals."""
-        values = [board.reliability for board in self.boards if np.isfinite(board.reliability)]
-        return float(np.mean(values)) if values else float("nan")
+        return float(finite_mean(np.array([board.reliability for board in self.boards])))
 
     def answer(self, wanted: float = WANTED) -> str:
         """Say in one sentence whether the design can tell the candidates apart.
@@ -122,6 +120,8 @@ class Recovery:
         interval = self.wins()
         said = f"the true network comes first in {self.win_rate:.0%} of {len(self.boards)} boards"
         said += f" [{interval.low:.0%}, {interval.high:.0%}]; by chance it would in {1 / len(self.names):.0%}"
+        if interval.low >= wanted > np.mean([board.reliable for board in self.boards]):
+            return f"Not by scores that count: {said}, but the animals' reliability is below {RELIABILITY_GATE:g}."
         tie = self.outcomes["tie"]
         if interval.low >= wanted and self.outcomes["win"] < wanted:
             return f"Not beyond these stimuli: {said}, but {tie:.0%} of the pairs with it tie."
@@ -154,11 +154,9 @@ class Recovery:
         notes = []
         if self.design.population.animals < FEWEST_ANIMALS or self.stimuli < FEWEST_STIMULI:
             notes.append(f"All pairs tie: tests need {FEWEST_ANIMALS} animals and {FEWEST_STIMULI} stimuli.")
-        undefined = sum(not np.isfinite(board.scaled).any() for board in self.boards)
-        if undefined:
+        if undefined := sum(not np.isfinite(board.scaled).any() for board in self.boards):
             notes.append(f"{undefined} boards have no score: their animals cannot be compared.")
-        shared = sum(board.first is None for board in self.boards) - undefined
-        if shared:
+        if shared := sum(board.first is None for board in self.boards) - undefined:
             notes.append(f"{shared} boards have no first: the highest score is shared.")
         return tuple(notes)
 
@@ -363,6 +361,11 @@ class RecoveryBoard(NullIsNaN):
     """Mean split-half reliability of the animals."""
 
     @property
+    def reliable(self) -> bool:
+        """False where scores are unreliable, which no leaderboard ranks."""
+        return not self.reliability < RELIABILITY_GATE
+
+    @property
     def first(self) -> int | None:
         """Candidate with the highest score; None where no score is defined or the highest is shared."""
         values = np.array(self.scaled)
@@ -543,15 +546,9 @@ class TriedDesign:
     """Trials of each stimulus."""
     stimuli: int
     win_rate: float
-    """Share of boards in which the true candidate came first."""
+    """Share of boards in which the true candidate came first, by scores that are reliable."""
     interval: Interval
     """Wilson's interval of ``win_rate``."""
-
-
-def _cost(numbers: tuple[int, int, int, int]) -> tuple[int, int, int]:
-    """Return what a design costs: trials of all animals together, then units, then animals."""
-    animals, units, trials, stimuli = numbers
-    return animals * trials * stimuli, units, animals
 
 
 def find_cheapest(
@@ -573,7 +570,8 @@ def find_cheapest(
     check_number("The wanted rate", wanted, above=0, below=1)
     pool = len(candidates[0].stimuli)
     sizes = [size for size in STIMULI if size < pool] + [pool]
-    grid = sorted(product(ANIMALS, UNITS, TRIALS, sizes), key=_cost)
+    every = product(ANIMALS, UNITS, TRIALS, sizes)
+    grid = sorted((a * trials * stimuli, units, a, (a, units, trials, stimuli)) for a, units, trials, stimuli in every)
     tried: list[TriedDesign] = []
     failed: list[tuple[int, ...]] = []
 
@@ -581,10 +579,12 @@ def find_cheapest(
         """Return what boards of a design recover."""
         population = replace(design.population, animals=animals, units=units, trials=trials)
         changed = replace(design, population=population, stimuli=stimuli)
-        result = recover(candidates, changed, **counted, **where)
-        return TriedDesign(animals, units, trials, stimuli, result.win_rate, result.wins())
+        results = recover(candidates, changed, **counted, **where).boards
+        won = sum(board.reliable and board.first == board.true for board in results)
+        interval = wilson_interval(won, len(results), over="boards")
+        return TriedDesign(animals, units, trials, stimuli, won / len(results), interval)
 
-    for numbers in track(grid, "trying designs", progress):
+    for *_, numbers in track(grid, "trying designs", progress):
         if any(all(mine <= other for mine, other in zip(numbers, one, strict=True)) for one in failed):
             continue
         attempt = measured(*numbers, boards=boards, first=0)

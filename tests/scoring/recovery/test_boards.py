@@ -232,13 +232,20 @@ def test_none_is_named_where_none_suffices(small):
     assert tried
 
 
+def test_no_design_is_named_whose_scores_are_unreliable(small, monkeypatch):
+    monkeypatch.setattr(boards, "RELIABILITY_GATE", 1.1)
+    best, tried = find_cheapest(make_candidates(14), DESIGN, 0.7, boards=3, workers=1)
+    assert best is None
+    assert not any(design.win_rate for design in tried)
+
+
 def test_a_rate_lies_between_0_and_1():
     with pytest.raises(UsageError, match="received 1"):
         find_cheapest(make_candidates(), DESIGN, 1.0)
 
 
-def _board(true, number, scaled, told=(0, 0)):
-    return RecoveryBoard(true, number, "layer1", scaled, told, 0.5)
+def _board(true, number, scaled, told=(0, 0), reliability=0.5):
+    return RecoveryBoard(true, number, "layer1", scaled, told, reliability)
 
 
 def test_boards_are_counted_by_who_made_them_and_who_came_first():
@@ -279,6 +286,17 @@ def test_boards_without_a_score_or_with_equal_ones_have_no_winner():
         "1 boards have no score: their animals cannot be compared.",
         "1 boards have no first: the highest score is shared.",
     )
+
+
+def test_scores_that_are_unreliable_are_no_yes():
+    # Of 60 units and 5 trials all scores were unreliable, and the answer was Yes, first in 100 % of the boards.
+    wins = ((0.9, 0.1), (0, 1)), ((0.1, 0.9), (1, 0))
+    noisy = tuple(_board(number % 2, number, *wins[number % 2], 0.4) for number in range(40))
+    answer = Recovery(("a", "b"), DESIGN, 12, noisy).answer()
+    assert answer.startswith("Not by scores that count: the true network comes first in 100% of 40 boards")
+    assert answer.endswith("but the animals' reliability is below 0.5.")
+    clean = tuple(replace(board, reliability=value) for board, value in zip(noisy, [0.6, math.nan] * 20, strict=True))
+    assert Recovery(("a", "b"), DESIGN, 12, clean).answer().startswith("Yes")
 
 
 def test_copies_of_a_network_are_named_and_never_ranked_by_rounding():
