@@ -58,7 +58,7 @@ def decode(
     """Decode a property from activations or trials, leaving one stimulus out.
 
     Args:
-        responses: [R, U] one row per trial, or [K, F] one per stimulus.
+        responses: [R, U] one row per trial, or [K, F] one per stimulus. Stimuli of few trials count as much as others.
         stimuli: [R] stimulus of each row, 0 … K−1.
         classes: [K] class of each stimulus, such as ``["convex", "convex", "concave", …]``.
         penalty: Inverse strength C of the penalty, on features scaled to unit mean square.
