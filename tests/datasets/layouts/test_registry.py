@@ -5,61 +5,18 @@ import sys
 
 import numpy as np
 import pytest
-import xarray as xr
 
 from brainbench.core.errors import DataError, MissingDependencyError, UsageError
 from brainbench.datasets import (
     RecordingLayout,
-    check,
-    export,
     fetch,
-    inspect,
     open_recordings,
     register_layout,
     write_recordings,
 )
 from brainbench.datasets.layouts.registry import get_layout, list_layouts
 from brainbench.datasets.trials.selection import Conditions, Selection, Window
-from tests.factories.dandi_files import write_area2, write_hires, write_yu
 from tests.factories.recordings import make_simple_session
-
-WRITERS = {"yu": write_yu, "hires": write_hires, "area2-bump": write_area2}
-
-
-@pytest.fixture(params=WRITERS)
-def layout(request, tmp_path):
-    path = tmp_path / "sub-x_ses-20200101.nwb"
-    return request.param, path, WRITERS[request.param](path)
-
-
-def test_each_layout_is_detected_read_and_declared_healthy(layout):
-    name, path, _ = layout
-    dataset = open_recordings(path)
-    assert dataset.attrs["layout"] == f"{name} (detected from its columns)"
-    checkup = check(path)
-    assert checkup.count("error") == 0, str(checkup)
-    assert "spikes answer touch" in str(checkup)
-    assert inspect(path).layout == name
-    assert inspect(path).sessions[0].units.spikes > 0
-    assert get_layout(name).dandiset in get_layout(name).title
-
-
-def test_copies_of_each_layout_are_small_and_equal(layout, tmp_path):
-    name, path, _ = layout
-    for suffix in (".nwb", ".h5"):
-        (copy,) = export(path, tmp_path / f"copy{suffix}")
-        one, two = open_recordings(path, bin=0.1), open_recordings(copy, bin=0.1)
-        xr.testing.assert_identical(one.drop_attrs(), two.drop_attrs())
-        assert two.attrs["layout"] == f"{name} (detected from its columns)"
-        assert one.attrs["content_hash"] == two.attrs["content_hash"]
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_copies_of_each_layout_are_valid_for_pynwb(layout, tmp_path):
-    pynwb = pytest.importorskip("pynwb")
-    (copy,) = export(layout[1], tmp_path / "copy.nwb")
-    assert list(pynwb.validate(path=str(copy))) == []
-
 
 # A layout of one's own
 
