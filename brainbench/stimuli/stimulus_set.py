@@ -1,7 +1,7 @@
 """Stimulus sets: files (HDF5, written atomically, read with their hash checked), the network's grid, other axes.
 
 The package has sets of some recipes as its own engine gave them, found without building their scenes, so that a first
-score neither compiles nor simulates (``python -m tests.factories.shipped_stimuli`` writes them). The errors of their
+score neither compiles nor simulates (``python -m tests.stimuli.test_stimulus_set`` writes them). The errors of their
 whiskers stand beside them.
 """
 

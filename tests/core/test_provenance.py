@@ -3,12 +3,12 @@ import math
 
 from brainbench.core.files import to_json
 from brainbench.core.provenance import Provenance, UniquePart
-from tests.factories.records import three_stimuli_score
+from tests.factories.records import make_score
 
 
 def test_provenance_is_typed_and_keeps_what_it_does_not_know():
     stated = {"version": "0.1.0", "recordings": {"source": "demo"}, "seed": 3, "command": 7, "settings": {}}
-    origin = three_stimuli_score(provenance=stated).provenance
+    origin = make_score(provenance=stated).provenance
     assert isinstance(origin, Provenance)
     assert (origin.version, origin.recordings["source"]) == ("0.1.0", "demo")
     assert origin.command == ""  # of another kind, so it counts as absent
@@ -42,12 +42,12 @@ def test_a_unique_part_is_read_where_numbers_state_it():
         "shared": 0.1,
         "controls": ["raw"],
     }
-    part = three_stimuli_score(provenance={"statistics": {"unique": stated}}).provenance.unique
+    part = make_score(provenance={"statistics": {"unique": stated}}).provenance.unique
     assert part is not None
     assert (part.unique, part.low, part.high, part.shared, part.controls) == (0.5, 0.25, 0.75, 0.1, ("raw",))
-    assert three_stimuli_score().provenance.unique is None
+    assert make_score().provenance.unique is None
     for damaged in ({"unique": "1"}, {"unique": True, "interval": 3}, {"unique": None, "interval": [1], "controls": 4}):
-        part = three_stimuli_score(provenance={"statistics": {"unique": damaged}}).provenance.unique
+        part = make_score(provenance={"statistics": {"unique": damaged}}).provenance.unique
         assert part is not None
         assert math.isnan(part.unique)
         assert math.isnan(part.low)

@@ -1,17 +1,33 @@
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from brainbench.core.errors import DataError
-from brainbench.core.records import (
-    Interval,
-    ModelCard,
-    ResultRecord,
-    Score,
-)
-from tests.factories.records import three_stimuli_score
+from brainbench.core.records import Ceiling, Interval, LayerScore, ModelCard, ResultRecord, Score, SubjectScore
+
+
+def three_stimuli_score(**changes: object) -> Score:
+    """Return a score of two layers, one animal and three stimuli."""
+    score = Score(
+        "zhuang",
+        0.8,
+        "ok",
+        r=0.7,
+        reliability=0.9,
+        interval=Interval(0.6, 1.1, method="t"),
+        p=0.01,
+        ceiling=Ceiling(0.8, 0.9),
+        layer="conv2",
+        layers=(LayerScore("conv1", math.nan, math.nan, "undefined"), LayerScore("conv2", 0.8, 0.7)),
+        subjects=(SubjectScore("a", 0.8, 0.7, 0.9, units=3, trials=7, layer="conv2"),),
+        stimuli=("x", "y", "z"),
+        model_rdm=(0.1, 0.2, math.nan),
+        provenance={"time": "now", "seed": 0},
+    )
+    return replace(score, **changes)
 
 
 def test_a_score_survives_json_with_its_nans():

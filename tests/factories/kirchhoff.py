@@ -132,17 +132,6 @@ def press_rod(
     return RodEquilibrium(force, moment, float(at[0]), _integrate(rod, force, moment, float(at[0]))[0])
 
 
-def trace_rod(rod: KirchhoffRod, equilibrium: RodEquilibrium, arcs: Array) -> tuple[Array, Array, Array]:
-    """Return points [n, 3] (m), axes of the cross-section [n, 3, 3] (columns) and twist [n] (rad) of an equilibrium.
-
-    ``arcs`` [n] (m) increase from 0 to the place of the force at most.
-    """
-    points, frames, moments = _paths(rod, equilibrium.force, equilibrium.moment, arcs)
-    rates = np.einsum("nd,nd->n", moments, frames[:, :, 0]) / [rod.torsion(float(s)) for s in arcs]
-    twist = np.concatenate([[0.0], np.cumsum((rates[1:] + rates[:-1]) / 2 * np.diff(arcs))])
-    return points, frames, twist
-
-
 def _solve(residual: Callable[[NDArray], NDArray], start: NDArray) -> NDArray[np.float64]:
     from scipy.optimize import root
 
@@ -157,11 +146,11 @@ def _integrate(rod: KirchhoffRod, force: Array, moment: Array, arc: float) -> tu
     if not 0 < arc <= rod.length:
         nowhere = np.full(3, np.nan)
         return nowhere, nowhere, nowhere
-    points, frames, moments = _paths(rod, force, moment, np.array([arc]))
+    points, frames, moments = rod_paths(rod, force, moment, np.array([arc]))
     return points[-1], frames[-1, :, 0], moments[-1]
 
 
-def _paths(rod: KirchhoffRod, force: Array, moment: Array, arcs: Array) -> tuple[Array, Array, Array]:
+def rod_paths(rod: KirchhoffRod, force: Array, moment: Array, arcs: Array) -> tuple[Array, Array, Array]:
     """Return points [n, 3], axes [n, 3, 3] and moments [n, 3] at ``arcs`` [n]."""
     from scipy.integrate import solve_ivp
 

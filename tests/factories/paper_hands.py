@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from robotics_bridge.deploy.controller import Controller
@@ -85,20 +83,3 @@ def run_session(spoil=None, *, policy=None, seconds=2.0, clock=None, **changes):
         make_contract(changes.pop("groups", ("proprio",))), make_limits(), clock=clock, **changes,
     )  # fmt: skip
     return controller.run(seconds), hand, controller
-
-
-class NotingHand(PaperHand):
-    """Notes how old the newest report is at each command; may lose time after it took a report."""
-
-    def __init__(self, clock: Clock, lose_time: Callable[[str], None] = lambda _: None) -> None:
-        super().__init__(clock)
-        self.lose_time, self.ages = lose_time, []
-
-    def read(self) -> HandReading | None:
-        reading = super().read()
-        self.lose_time("read")
-        return reading
-
-    def send(self, targets) -> None:
-        self.ages.append(self.clock() - self.last.arrived)
-        super().send(targets)

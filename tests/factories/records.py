@@ -30,27 +30,6 @@ MODEL_RDM = tuple((i * j + 1) / 31 for i, j in combinations(range(6), 2))
 BRAIN_RDM = tuple((i + j) / 9 for i, j in combinations(range(6), 2))
 
 
-def three_stimuli_score(**changes: object) -> Score:
-    """Return a score of two layers, one animal and three stimuli."""
-    score = Score(
-        "zhuang",
-        0.8,
-        "ok",
-        r=0.7,
-        reliability=0.9,
-        interval=Interval(0.6, 1.1, method="t"),
-        p=0.01,
-        ceiling=Ceiling(0.8, 0.9),
-        layer="conv2",
-        layers=(LayerScore("conv1", math.nan, math.nan, "undefined"), LayerScore("conv2", 0.8, 0.7)),
-        subjects=(SubjectScore("a", 0.8, 0.7, 0.9, units=3, trials=7, layer="conv2"),),
-        stimuli=("x", "y", "z"),
-        model_rdm=(0.1, 0.2, math.nan),
-        provenance={"time": "now", "seed": 0},
-    )
-    return replace(score, **changes)
-
-
 def make_score(name: str = "zhuang", value: float = 0.523, *, status: str = "ok", **changes: object) -> Score:
     fields: dict[str, object] = {
         "name": name,

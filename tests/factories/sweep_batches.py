@@ -15,7 +15,7 @@ from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.scenes.scene import Frames
 from brainbench.stimuli.sweeps.generation import generate
 from brainbench.stimuli.sweeps.plan import GenerationPlan, GenerationSettings
-from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepGrid, SweepScenes
+from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepGrid
 
 GRID = dataclasses.replace(
     GRIDS["thesis-low"],
@@ -38,11 +38,6 @@ class _Smooth(SweepGrid):
         return dataclasses.replace(
             scene, objects=tuple(dataclasses.replace(item, friction=0.0) for item in scene.objects)
         )
-
-
-def small_scenes(objects=("brick:2", "cone:2"), whiskers="C3", grid=GRID):
-    found = resolve_objects(objects, collision="hull")
-    return SweepScenes(grid, {name: item.load for name, item in found.items()}, whiskers=whiskers)
 
 
 def small_plan(objects=("brick:2", "cone:2"), *, whiskers="C3", grid=GRID, fidelity=None, **settings):

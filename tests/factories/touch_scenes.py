@@ -6,8 +6,10 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
+from brainbench.core.devices import warp
 from robotics_bridge.physics import Geometry, HandState, TouchScene
 from robotics_bridge.sensors import Probes, SensorSuite, TemperatureGrid
 from robotics_bridge.sensors.temperature.materials import ThermalMaterial
@@ -125,3 +127,9 @@ def touch_face(state: HandState, half: float, envs=(0,), depth: float = 0.0, hei
         env, np.tile([[0, 1]], (len(env), 1)), distance=np.full(len(env), -depth),
         position=np.tile(corners, (len(envs), 1)), normal=np.tile([0.0, 0, 1], (len(env), 1)),
     )  # fmt: skip
+
+
+def require_processor() -> None:
+    """Skip a test that compares with a processor where Warp has no compiler for it."""
+    if not warp().is_cpu_available():
+        pytest.skip("compares with a processor, for which this build of Warp has no compiler")

@@ -1,3 +1,9 @@
+"""Stimulus sets, and those that the package ships.
+
+``python -m tests.stimuli.test_stimulus_set`` simulates the latter again, to be done whenever ``PHYSICS_VERSION`` is
+raised or the scenes of their recipes change; ``python -m tests.stimuli.test_stimulus_set errors`` only their errors.
+"""
+
 from __future__ import annotations
 
 import subprocess
@@ -7,26 +13,44 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import xarray as xr
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.files import read_json
+from brainbench.core.files import atomic_path, read_json, to_json, write_json, write_text
 from brainbench.core.reading.sealed import is_sealed, seal_file
 from brainbench.stimuli import get_recipe, load_stimuli, simulation, stimulus_set
+from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.scenes.scene import Frames, Scene
-from brainbench.stimuli.simulation import simulate
+from brainbench.stimuli.simulation import cache_path, simulate, simulate_uncached
 from brainbench.stimuli.stimulus_set import (
     SHIPPED,
     SHIPPED_INDEX,
+    error_file,
     find_kept,
     hash_stimulus_set,
     read_stimulus_set,
+    shipped_facts,
     to_grid,
     write_stimulus_set,
 )
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from tests.factories.engines import FakeEngine
-from tests.factories.shipped_stimuli import RECIPES, entry_name, simulate_again
+
+RECIPES = ("objects", "rodgers")
+"""Stimuli of the demo recordings, and of whatever names none."""
+FIDELITY = Fidelity.of("balanced,twist=false")
+"""The default, as scenes without twist resolve it."""
+
+
+def entry_name(recipe: str) -> str:
+    """Return the name of the cache's entry for a recipe with default options."""
+    return cache_path(get_recipe(recipe).scenes, FIDELITY, get_engine("rod")).name
+
+
+def simulate_again(recipe: str, *, errors: bool = False) -> xr.Dataset:
+    """Return the set of a recipe, simulated now."""
+    return simulate_uncached(get_recipe(recipe).scenes, FIDELITY, get_engine("rod", errors=errors))
 
 
 def _dataset(whiskers="all", side="right", count=110, unstable=None):
@@ -116,7 +140,7 @@ def test_columns_that_are_not_one_per_whisker_are_refused_in_one_sentence():
         to_grid(longer)
 
 
-ADVICE = "The package's stimuli are not those of its recipes: run 'python -m tests.factories.shipped_stimuli'."
+ADVICE = "The package's stimuli are not those of its recipes: run 'python -m tests.stimuli.test_stimulus_set'."
 
 
 @pytest.fixture(autouse=True)
@@ -194,3 +218,32 @@ def test_the_set_of_the_package_is_what_its_recipe_gives(recipe: str):
         held, now = (item["wrench"].values[..., channels] for item in (found, made))
         # Contact magnifies what single precision rounds otherwise on another processor.
         assert np.abs(held - now).max() <= 5e-3 * np.abs(held).max(), ADVICE
+
+
+def write_errors() -> None:
+    """Write the errors of the sets beside them."""
+    for recipe in RECIPES:
+        dataset = simulate_again(recipe, errors=True)
+        values = {name: np.char.mod("%.3g", dataset[name].values).astype(float) for name in ("error", "damping")}
+        assert np.isfinite(values["error"]).all()
+        write_text(error_file(SHIPPED / entry_name(recipe)), to_json(values, indent=None) + "\n")
+
+
+def write() -> None:
+    SHIPPED.mkdir(exist_ok=True)
+    for old in SHIPPED.iterdir():
+        old.unlink()
+    index = {}
+    for recipe in RECIPES:
+        dataset, path = simulate_again(recipe), SHIPPED / entry_name(recipe)
+        small = {name: {"zlib": True, "complevel": 9} for name, held in dataset.items() if held.dtype.kind in "fb"}
+        with atomic_path(path) as temporary:
+            dataset.to_netcdf(temporary, engine="h5netcdf", encoding=small)
+        seal_file(path)
+        index[recipe] = {"entry": path.name, **shipped_facts(recipe)}
+    write_json(SHIPPED_INDEX, index)
+    write_errors()
+
+
+if __name__ == "__main__":
+    write_errors() if sys.argv[1:] == ["errors"] else write()

@@ -16,7 +16,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,9 +25,26 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from robotics_bridge.deploy.controller import Controller, Report
-from robotics_bridge.deploy.driver import Clock
+from robotics_bridge.deploy.driver import Clock, HandReading
 from robotics_bridge.deploy.safety import SILENCE, ClockOffset, SafeLink, SafetyLimits
-from tests.factories.paper_hands import NotingHand, OwnClock, PaperHand, make_contract, make_limits, run_session
+from tests.factories.paper_hands import OwnClock, PaperHand, make_contract, make_limits, run_session
+
+
+class NotingHand(PaperHand):
+    """Notes how old the newest report is at each command; may lose time after it took a report."""
+
+    def __init__(self, clock: Clock, lose_time: Callable[[str], None] = lambda _: None) -> None:
+        super().__init__(clock)
+        self.lose_time, self.ages = lose_time, []
+
+    def read(self) -> HandReading | None:
+        reading = super().read()
+        self.lose_time("read")
+        return reading
+
+    def send(self, targets) -> None:
+        self.ages.append(self.clock() - self.last.arrived)
+        super().send(targets)
 
 
 class JitteringClock(OwnClock):
@@ -126,7 +143,8 @@ _SESSION = """
 import json
 import numpy as np
 from robotics_bridge.deploy.controller import Clock, Controller
-from tests.factories.paper_hands import NotingHand, make_contract, make_limits
+from tests.factories.paper_hands import make_contract, make_limits
+from tests.robotics_bridge.deploy.test_safety import NotingHand
 
 hand = NotingHand(Clock())
 limits = make_limits(rate_share=0.01)

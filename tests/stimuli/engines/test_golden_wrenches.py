@@ -17,7 +17,7 @@ ADVICE = (
     "The engines give other numbers than before. If that is meant, raise brainbench.stimuli.engines.PHYSICS_VERSION, "
     "so that no cached simulation of the old physics is taken for the new one, and write these numbers again with "
     "'python -m tests.stimuli.engines.test_golden_wrenches', and the package's stimuli with 'python -m "
-    "tests.factories.shipped_stimuli'; if not, the change has a fault."
+    "tests.stimuli.test_stimulus_set'; if not, the change has a fault."
 )
 GOLDEN = Path(__file__).parent / "golden" / "wrenches.json"
 FRAMES = (15, 30, 45, 60, 75, 95)

@@ -18,7 +18,7 @@ from brainbench.stimuli.simulation import bending_moments, record
 from brainbench.stimuli.tracks.contract import new_shapes
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from brainbench.stimuli.whiskers.whisker import Whisker, build_chain
-from tests.factories.kirchhoff import KirchhoffRod, load_rod, trace_rod
+from tests.factories.kirchhoff import KirchhoffRod, load_rod, rod_paths
 
 ENGINES = pytest.mark.parametrize("backend", ["rod", "mujoco"])
 ROD = Whisker(0.03, 5e-5, 2e-5, 3e9, 1300.0, 1.0)
@@ -127,7 +127,7 @@ def test_stiffness_is_that_of_a_kirchhoff_rod(whisker, backend, force):
     np.testing.assert_array_less(np.abs(loaded.wrench[0] - exact.wrench), 0.01 * scale + 1e-12)
     # Joint 19 of 24 links lies a little before the load; all of them on the loaded rod.
     arcs = np.linspace(0, 0.03, 25)[:20]
-    points, _, _ = trace_rod(rod, exact, np.append(arcs, arc))
+    points, _, _ = rod_paths(rod, exact.force, exact.moment, np.append(arcs, arc))
     bend = np.linalg.norm(points[-1] - unbent)
     assert bend > 5e-4
     assert np.linalg.norm(loaded.link_positions[0, :20] - points[:20], axis=1).max() < 0.02 * bend

@@ -38,7 +38,12 @@ from brainbench.stimuli.sweeps.plan import (
 )
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
 from tests.factories.engines import FakeEngine
-from tests.factories.sweep_batches import GRID, small_plan, small_scenes
+from tests.factories.sweep_batches import GRID, small_plan
+
+
+def small_scenes(whiskers="C3", grid=GRID):
+    solids = resolve_objects(("brick:2", "cone:2"), collision="hull")
+    return SweepScenes(grid, {name: item.load for name, item in solids.items()}, whiskers=whiskers)
 
 
 def _labels(**counts):

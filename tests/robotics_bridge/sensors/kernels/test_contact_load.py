@@ -24,8 +24,8 @@ from robotics_bridge.sensors import (
 )
 from robotics_bridge.sensors.audio.sensors import Modes
 from robotics_bridge.sensors.temperature.grid import ThermalBody
-from tests.factories.sensor_episode import require_processor
 from tests.factories.touch_scenes import PAD as PAD_OF_HAND
+from tests.factories.touch_scenes import require_processor
 
 mujoco = pytest.importorskip("mujoco")
 wp = warp()

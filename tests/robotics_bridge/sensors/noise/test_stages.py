@@ -13,7 +13,7 @@ from brainbench.core.errors import UsageError
 from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice
 from robotics_bridge.sensors.noise.model import Noise, stream_key
 from robotics_bridge.sensors.noise.stages import ReadingNoise, gaussian_weights, noise_params, simulate
-from tests.factories.sensor_episode import require_processor
+from tests.factories.touch_scenes import require_processor
 
 
 def _constant(value: float = 0.0, steps: int = 50, envs: int = 40, probes: int = 30, channels: int = 2) -> np.ndarray:

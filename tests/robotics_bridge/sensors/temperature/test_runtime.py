@@ -16,8 +16,7 @@ from robotics_bridge.sensors.suite import SensorSuite
 from robotics_bridge.sensors.temperature.grid import TemperatureGrid
 from robotics_bridge.sensors.temperature.materials import ThermalBody
 from robotics_bridge.sensors.temperature.runtime import diffusion, link_temperature, lost_contacts
-from tests.factories.sensor_episode import require_processor
-from tests.factories.touch_scenes import make_grid, touch_face
+from tests.factories.touch_scenes import make_grid, require_processor, touch_face
 
 
 @settings(max_examples=25)
