@@ -7,9 +7,9 @@ import pytest
 import trimesh
 
 from brainbench.geometry import load_mesh
+from brainbench.stimuli import load_stimuli
 from brainbench.stimuli.objects import procedural
 from brainbench.stimuli.stimulus_set import hash_stimulus_set, write_stimulus_set
-from tests.factories.recordings import make_stimuli
 
 
 @pytest.mark.parametrize("command", ["list", "show", "simulate", "render", "plot"])
@@ -44,7 +44,7 @@ def test_show_as_json_is_si(run, scene):
 
 @pytest.mark.parametrize("scene", ["no JSON", "[]", "[{}]", "[1]", "null", "[" * 5000])
 def test_show_refuses_a_set_whose_scenes_are_no_scenes(run, tmp_path, scene):
-    dataset = make_stimuli(whiskers=2).assign_attrs(scene=scene)
+    dataset = load_stimuli("rodgers", whiskers="C2").dataset.assign_attrs(scene=scene)
     file = write_stimulus_set(dataset.assign_attrs(content_hash=hash_stimulus_set(dataset)), tmp_path / "set.h5")
     result = run("stimuli", "show", str(file))
     assert (result.status, result.err.count("\n")) == (1, 1)

@@ -322,8 +322,8 @@ def test_damaged_spikes_are_an_error_and_not_an_exception(tmp_path):
 @pytest.fixture(scope="session")
 def demo_files(tmp_path_factory):
     from brainbench.datasets.synthetic import make_rodgers_demo
-    from tests.factories.recordings import make_stimuli
+    from brainbench.stimuli import load_stimuli
 
     folder = tmp_path_factory.mktemp("demo-check")
-    make_rodgers_demo(folder, make_stimuli())
+    make_rodgers_demo(folder, load_stimuli("rodgers").dataset)
     return folder

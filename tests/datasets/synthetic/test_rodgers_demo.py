@@ -1,13 +1,45 @@
 import h5py
 import numpy as np
 import pytest
+import xarray as xr
 
+from brainbench.core.contracts import CHANNELS
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import file_hash
 from brainbench.datasets import inspect, open_recordings
 from brainbench.datasets.synthetic import ensure_rodgers_demo, make_rodgers_demo, read_truth
 from brainbench.datasets.trials.session_trials import trials_by_subject
-from tests.factories.recordings import LABELS, make_stimuli
+from tests.factories.recordings import LABELS
+
+
+def make_stimuli():
+    """Whisking-like bursts of contact: six stimuli × 110 frames of 9 ms on the mouse's 30 whiskers."""
+    random = np.random.default_rng(0)
+    cells = [(row, col) for row, number in enumerate((5, 5, 7, 7, 6)) for col in range(number)]
+    row, col = np.array(cells).T
+    time = np.arange(110) * 0.009
+    phase = np.sin(2 * np.pi * 20 * time)[None, :, None]
+    shape, place = np.repeat([0, 1], 3)[:, None, None], np.tile([0.0, 1.0, 2.0], 2)[:, None, None]
+    bulge = np.where(shape == 0, -((col - 1.5) ** 2), (col - 1.5) ** 2) * 0.12
+    depth = np.maximum(phase * np.minimum(time / 0.2, 1.0)[None, :, None] - 0.1 - 0.2 * place - bulge - 0.05 * row, 0.0)
+    direction = random.normal(size=(6, len(cells), 6)) + 2.0 * random.normal(size=(1, len(cells), 6))
+    scale = np.array([1e-4] * 3 + [1e-6] * 3)
+    wrench = depth[..., None] * direction[:, None] * scale + 1e-7 * scale * phase[..., None]
+    return xr.Dataset(
+        {
+            "wrench": (("stimulus", "time", "whisker", "channel"), wrench.astype(np.float32)),
+            "contact": (("stimulus", "time", "whisker"), depth > 0),
+        },
+        {
+            "stimulus": list(LABELS),
+            "time": time,
+            "whisker": [f"{'ABCDE'[r]}{c}" for r, c in cells],
+            "row": ("whisker", row),
+            "col": ("whisker", col),
+            "channel": list(CHANNELS),
+        },
+        dict.fromkeys(("array", "scene", "fidelity", "seed", "backend", "version"), "test") | {"content_hash": "fake"},
+    )
 
 
 @pytest.fixture(scope="module")
