@@ -90,9 +90,15 @@ def run(
 @pytest.fixture
 def files(tmp_path: Path) -> dict[str, str]:
     """Files of a recording of two animals, and features, stimuli and a model for its four conditions."""
-    from tests.factories.scored_files import write_scored_files
+    from tests.factories.scored_files import write_study
 
-    return write_scored_files(tmp_path)
+    (tmp_path / "mine.py").write_text(
+        "from torch import nn\n\n\nclass Mine(nn.Module):\n"
+        "    def __init__(self):\n        super().__init__()\n        self.gru = nn.GRU(8, 6, batch_first=True)\n\n"
+        "    def forward(self, x):\n        return self.gru(x.flatten(2))[0][:, -1]\n"
+    )
+    paths = write_study(tmp_path, "xy", "abcd", repeats=10, until=60.0, arrays="arrays.h5")
+    return paths | {"model": f"{tmp_path / 'mine.py'}:Mine"}
 
 
 @pytest.fixture

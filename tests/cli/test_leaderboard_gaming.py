@@ -16,7 +16,7 @@ from leaderboards import rank
 @pytest.fixture
 def scored(study):
     """Return a function from {layer: [K, F]} to its record on four animals and eight stimuli."""
-    recordings = open_recordings(study["data"], conditions="trials:texture")
+    recordings = open_recordings(study["recordings"], conditions="trials:texture")
 
     def call(layers: dict[str, np.ndarray]) -> ResultRecord:
         return score_record(layers, recordings=recordings, stimuli=study["arrays"], time="mean")

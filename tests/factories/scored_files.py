@@ -1,6 +1,5 @@
-"""Recordings, features, stimuli and models in files, for the command line to score."""
+"""Recordings, features and stimuli in files, for the command line to score."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import h5py
@@ -11,12 +10,29 @@ from brainbench.datasets.sessions import make_session
 from brainbench.models.features import write_features
 from brainbench.scoring.options import ScoreOptions
 
-LABELS = ("a", "b", "c", "d")
-EIGHT = tuple("abcdefgh")
+
+def write_arrays(path: Path, labels: str) -> Path:
+    """Write random arrays as stimuli."""
+    with h5py.File(path, "w") as file:
+        file["stimuli"] = np.random.default_rng(1).normal(size=(len(labels), 3, 2, 2, 2)).astype(np.float32)
+        file["labels"] = np.array(list(labels), dtype=h5py.string_dtype())
+    return path
 
 
-def _record(rng: np.random.Generator, folder: Path, animals: str, labels: Sequence[str], repeats: int, until: float):
-    """Write a recording of twelve units for each animal, observed until a time (s)."""
+def write_study(
+    folder: Path,
+    animals: str = "wxyz",
+    labels: str = "abcdefgh",
+    *,
+    repeats: int = 8,
+    until: float = 90.0,
+    arrays: str = "eight.h5",
+) -> dict[str, str]:
+    """Write a recording of twelve units for each animal, observed until a time (s); arrays and features of its stimuli.
+
+    Animals and labels are letters.
+    """
+    rng = np.random.default_rng(0)
     for animal in animals:
         order = np.repeat(np.arange(len(labels)), repeats)
         starts = 1.0 + np.arange(len(order))
@@ -32,45 +48,11 @@ def _record(rng: np.random.Generator, folder: Path, animals: str, labels: Sequen
         table = {"start_time": starts, "stop_time": starts + 0.5, "texture": [labels[k] for k in order]}
         seen = [np.array([[0.0, until]])] * 12
         session = make_session(animal, "1", spikes, {"trials": table}, observed=seen)
-        write_recordings(folder / f"{animal}.h5", session)
-
-
-def write_arrays(path: Path, labels: Sequence[str]) -> Path:
-    """Write random arrays as stimuli."""
-    with h5py.File(path, "w") as file:
-        file["stimuli"] = np.random.default_rng(1).normal(size=(len(labels), 3, 2, 2, 2)).astype(np.float32)
-        file["labels"] = np.array(list(labels), dtype=h5py.string_dtype())
-    return path
-
-
-def write_scored_files(tmp_path: Path) -> dict[str, str]:
-    """Write a recording of two animals, features and arrays for its four conditions."""
-    rng = np.random.default_rng(0)
-    _record(rng, tmp_path / "data", "xy", LABELS, 10, 60.0)
-    features = write_features(tmp_path / "features.h5", LABELS, {"fc": rng.normal(size=(4, 6))})
-    write_arrays(tmp_path / "arrays.h5", LABELS)
-    (tmp_path / "mine.py").write_text(
-        "from torch import nn\n\n\nclass Mine(nn.Module):\n"
-        "    def __init__(self):\n        super().__init__()\n        self.gru = nn.GRU(8, 6, batch_first=True)\n\n"
-        "    def forward(self, x):\n        return self.gru(x.flatten(2))[0][:, -1]\n"
-    )
-    return {
-        "recordings": str(tmp_path / "data"),
-        "features": str(features),
-        "arrays": str(tmp_path / "arrays.h5"),
-        "model": f"{tmp_path / 'mine.py'}:Mine",
-        "out": str(tmp_path / "out"),
-    }
-
-
-def write_study(tmp_path: Path) -> dict[str, str]:
-    """Write four animals and eight stimuli; features and a module for them."""
-    rng = np.random.default_rng(0)
-    _record(rng, tmp_path / "data", "wxyz", EIGHT, 8, 90.0)
-    write_arrays(tmp_path / "eight.h5", EIGHT)
-    features = write_features(tmp_path / "features.h5", EIGHT, {"fc": rng.normal(size=(len(EIGHT), 6))})
-    paths = {"data": "data", "arrays": "eight.h5", "board": "board", "secret": "secret", "out": "out"}
-    return {name: str(tmp_path / path) for name, path in paths.items()} | {"features": str(features)}
+        write_recordings(folder / "data" / f"{animal}.h5", session)
+    write_arrays(folder / arrays, labels)
+    features = write_features(folder / "features.h5", labels, {"fc": rng.normal(size=(len(labels), 6))})
+    paths = {"recordings": "data", "arrays": arrays, "board": "board", "secret": "secret", "out": "out"}
+    return {name: str(folder / path) for name, path in paths.items()} | {"features": str(features)}
 
 
 def write_laboratory(folder: Path) -> Path:

@@ -26,7 +26,7 @@ PARTS = ("--conditions", "trials:texture")
 
 
 def _hold_out(run, study, *what):
-    return run("leaderboard", "hold-out", study["data"], *what, *PARTS, "--out", study["board"], "--secret",
+    return run("leaderboard", "hold-out", study["recordings"], *what, *PARTS, "--out", study["board"], "--secret",
                study["secret"], "--json")  # fmt: skip
 
 
@@ -97,7 +97,7 @@ def test_the_public_part_does_not_take_the_place_of_the_recordings(run, study):
     public = Path(study["board"]) / "public.h5"
     before = public.read_bytes()
     for source in (public, public.parent):
-        again = _hold_out(run, study | {"data": str(source), "secret": study["secret"] + "2"}, "--animals", "2")
+        again = _hold_out(run, study | {"recordings": str(source), "secret": study["secret"] + "2"}, "--animals", "2")
         assert (again.status, public.read_bytes()) == (2, before)
         assert "would take the place" in again.err
 

@@ -70,7 +70,16 @@ def test_a_plan_is_sealed_and_a_score_that_deviates_is_marked(run, study, tmp_pa
     sealed = run("power", *design, "--layer", "fc", "--plan", plan, "--json")
     assert sealed.status == 0, sealed.err
     mark = json.loads(sealed.out)["plan"]["hash"]
-    score = ("score", study["features"], "-r", study["data"], "--conditions", "trials:texture", "--out", study["out"])
+    score = (
+        "score",
+        study["features"],
+        "-r",
+        study["recordings"],
+        "--conditions",
+        "trials:texture",
+        "--out",
+        study["out"],
+    )
     scored = run(*score, "--plan", plan)
     assert scored.status == 0, scored.err
     assert f"Plan: deviates from the sealed plan {mark}: 4 animals, planned 5." in " ".join(scored.out.split())
