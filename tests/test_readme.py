@@ -56,7 +56,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry, write_files
     from brainbench.models.features import write_features
     from brainbench.stimuli import get_recipe
-    from tests.factories.fitted_ringdown import write_ringdown
+    from tests.factories.whisker_measurements import write_ringdown
 
     folder = tmp_path_factory.mktemp("readme")
     (folder / "mine.py").write_text(MODEL)

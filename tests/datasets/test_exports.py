@@ -5,8 +5,7 @@ import xarray as xr
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import export, open_recordings, write_recordings
-from tests.factories.recording_files import HUMAN, write_nwb, write_rodgers
-from tests.factories.recordings import make_simple_session
+from tests.factories.recordings import HUMAN, make_simple_session, write_nwb, write_rodgers
 
 
 def same(one, two):

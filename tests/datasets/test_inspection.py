@@ -7,8 +7,7 @@ import pytest
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import to_json
 from brainbench.datasets import inspect, open_recordings, write_recordings
-from tests.factories.recording_files import detection, write_nwb, write_rodgers
-from tests.factories.recordings import make_simple_session
+from tests.factories.recordings import detection, make_simple_session, write_nwb, write_rodgers
 
 
 def test_proposals_put_stimulus_like_columns_first_and_times_nowhere(tmp_path):

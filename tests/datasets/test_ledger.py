@@ -4,8 +4,7 @@ import pytest
 from brainbench.core.errors import DataError
 from brainbench.datasets import check, inspect, open_recordings, write_recordings
 from brainbench.datasets.ledger import Ledger, balance_line
-from tests.factories.recording_files import write_nwb
-from tests.factories.recordings import make_simple_session
+from tests.factories.recordings import make_simple_session, write_nwb
 
 
 def test_a_balance_that_does_not_close_is_said_and_refused_when_strict():

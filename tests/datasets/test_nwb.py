@@ -10,7 +10,7 @@ from brainbench.datasets import inspect, open_recordings, write_recordings
 from brainbench.datasets.nwb import read_nwb
 from brainbench.datasets.sessions import make_session
 from brainbench.datasets.trials.session_trials import trials_by_subject
-from tests.factories.recording_files import HUMAN, write_nwb
+from tests.factories.recordings import HUMAN, write_nwb
 
 INTRACELLULAR = {
     "LantyerEtAl2018_170328_AB_277_ST50_C.nwb": "2 VoltageClampSeries",

@@ -5,8 +5,7 @@ import xarray as xr
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
 from brainbench.datasets import open_recordings, write_recordings
-from tests.factories.recording_files import write_nwb
-from tests.factories.recordings import make_simple_session
+from tests.factories.recordings import make_simple_session, write_nwb
 
 
 def write(path, made=None, **options):

@@ -12,8 +12,7 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import check, export, inspect, open_recordings, write_recordings
 from brainbench.datasets.sessions import Session, make_session
 from brainbench.datasets.trials.selection import Selection
-from tests.factories.recording_files import write_nwb
-from tests.factories.recordings import make_simple_session
+from tests.factories.recordings import make_simple_session, write_nwb
 
 
 def export_to(path):

@@ -1,4 +1,4 @@
-"""A post, a bar that bends a whisker, and motions of its base, with which engines are tested."""
+"""Whiskers, a post, a bar that bends a whisker, and motions of its base, with which engines are tested."""
 
 from __future__ import annotations
 
@@ -12,6 +12,16 @@ from brainbench.stimuli.objects.obstacle import Capsule, Obstacle
 from brainbench.stimuli.objects.solid import PlacedObject, capsule
 from brainbench.stimuli.scenes.scene import Frames, Head, Scene
 from brainbench.stimuli.whiskers.array import WhiskerArray
+from brainbench.stimuli.whiskers.whisker import Whisker
+
+C2 = Whisker(0.015265, 48.365e-6, 8.78e-6, young_modulus=5e9, density=(1260.0, 1690.0), damping_ratio=0.32)
+"""Mouse whisker C2, straightened."""
+H = Whisker(0.020, 50e-6, 5e-6, young_modulus=3e9, density=1300.0, damping_ratio=0.32)
+"""A made-up whisker, for which references were derived."""
+RAT = Whisker(0.040, 80e-6, 3e-6, young_modulus=3e9, density=1300.0, damping_ratio=0.15)
+"""A long, thin whisker as a rat's."""
+NEEDLE = Whisker(0.0056, 31e-6, 1.5e-6, young_modulus=5e9, density=1300.0, damping_ratio=0.32)
+"""A short whisker with a very thin tip."""
 
 
 def post(x, y, radius=1e-3, **options):

@@ -73,8 +73,7 @@ from tests.factories.hand_gallery import GALLERY
 from tests.factories.policies import contract_of, student_folder
 from tests.factories.published_files import lightning_state, make_zero_filled, write_published, write_run, write_sweep
 from tests.factories.reading_trials import Surface, bad_counts, not_finite, numbers, typed, written, written_json
-from tests.factories.recording_files import write_nwb
-from tests.factories.recordings import make_simple_session
+from tests.factories.recordings import make_simple_session, write_nwb
 from tests.factories.records import make_record
 from tests.factories.scene_files import POLE
 from tests.factories.scored_files import write_arrays

@@ -1,6 +1,5 @@
 """Random sweeps in SI, and labelled data sets in memory; classes differ in which whiskers are loaded."""
 
-import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -16,27 +15,27 @@ class ArrayBatches:
         self.sweeps, self.labels, self.options = torch.as_tensor(sweeps), torch.as_tensor(labels).long(), options
         self.epoch = self._batch = 0
 
+    def _rows(self) -> tuple[torch.Tensor, ...]:
+        """Return the rows of this epoch's batches.
+
+        Every process gets every number-th sweep of one order, and all equally many (the rest is left out): together
+        they see the batches that one process would, and none waits for the others for ever.
+        """
+        count, (rank, parts) = len(self.labels), self.options.part
+        # The order depends on seed and epoch alone, so going on in mid-epoch needs no state of a generator.
+        generator = torch.Generator().manual_seed(self.options.seed * 1_000_003 + self.epoch)
+        order = torch.randperm(count, generator=generator) if self.options.shuffle else torch.arange(count)
+        return order[: count // parts * parts][rank::parts].split(self.options.batch_size // parts)
+
     def __len__(self) -> int:
-        parts = self.options.part[1]
-        # Every process gets equally many sweeps (the rest is left out), or one would wait for the others for ever.
-        return math.ceil(len(self.labels) // parts / (self.options.batch_size // parts))
+        return len(self._rows())
 
     def __iter__(self) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
         if self._batch >= len(self):
             self.epoch, self._batch = self.epoch + 1, 0
-        rank, parts = self.options.part
-        count, size = len(self.labels) // parts * parts, self.options.batch_size // parts
-        order = torch.arange(len(self.labels))
-        if self.options.shuffle:
-            # The order depends on seed and epoch alone, so going on in mid-epoch needs no state of a generator.
-            generator = torch.Generator().manual_seed(self.options.seed * 1_000_003 + self.epoch)
-            order = torch.randperm(len(self.labels), generator=generator)
-        # Every number-th sweep of one shuffled order: processes together see the batches that one process would.
-        mine = order[:count][rank::parts]
-        while self._batch < len(self):
-            chosen = mine[self._batch * size : (self._batch + 1) * size]
+        for rows in self._rows()[self._batch :]:
             self._batch += 1
-            yield self.sweeps[chosen], self.labels[chosen]
+            yield self.sweeps[rows], self.labels[rows]
         self.epoch, self._batch = self.epoch + 1, 0
 
     def state_dict(self) -> dict[str, Any]:

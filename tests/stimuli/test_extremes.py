@@ -14,7 +14,7 @@ from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle, Sphere
 from brainbench.stimuli.validation import bench_tests
 from brainbench.stimuli.whiskers.whisker import build_chain
-from tests.factories.whiskers import C2
+from tests.factories.engine_scenes import C2
 
 pytestmark = pytest.mark.slow
 

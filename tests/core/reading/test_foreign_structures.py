@@ -48,13 +48,13 @@ from brainbench.core.identity import content_hash
 from robotics_bridge import hands
 from robotics_bridge.deploy.links.replay import PARTS, SessionFacts, TactilePoints, taxel_names, write_lerobot
 from tests.factories.damage import SPECIAL, TWINS, alter, change, damage
-from tests.factories.fitted_ringdown import write_ringdown
 from tests.factories.forks import fork
 from tests.factories.hand_gallery import GALLERY
 from tests.factories.policies import export_small
 from tests.factories.reading_surfaces import GRAPH, SURFACES, _checkpoint, _log
 from tests.factories.reading_trials import LONGEST, Outcome, attempt, numbers, written
 from tests.factories.scored_files import write_laboratory
+from tests.factories.whisker_measurements import write_ringdown
 from tests.factories.whisker_tracks import (
     bent_shapes,
     write_deeplabcut_csv,

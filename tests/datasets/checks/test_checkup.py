@@ -10,8 +10,7 @@ from brainbench.datasets import check, write_recordings
 from brainbench.datasets.sessions import make_session
 from brainbench.datasets.synthetic import write_files
 from tests.datasets.checks.healthy_sessions import GEOMETRY, findings_of, make_healthy
-from tests.factories.recording_files import HUMAN
-from tests.factories.recordings import as_recordings, quiet_design
+from tests.factories.recordings import HUMAN, as_recordings, quiet_design
 
 
 def test_a_healthy_session_is_told_so(tmp_path):

@@ -13,8 +13,14 @@ from brainbench.datasets.exports import subset
 from brainbench.datasets.reading import each_session, open_file
 from brainbench.datasets.sessions import SessionTable, ragged
 from tests.datasets.checks.healthy_sessions import GEOMETRY, examine, findings_of, make_healthy, with_spikes
-from tests.factories.recording_files import detection, write_nwb, write_rodgers
-from tests.factories.recordings import make_sessions, make_simple_session, quiet_design
+from tests.factories.recordings import (
+    detection,
+    make_sessions,
+    make_simple_session,
+    quiet_design,
+    write_nwb,
+    write_rodgers,
+)
 
 
 def test_severities_are_worst_first():

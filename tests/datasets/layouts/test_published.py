@@ -12,8 +12,7 @@ from brainbench.datasets import check, export, inspect, open_recordings, write_r
 from brainbench.datasets.layouts.published import recorded_runs
 from brainbench.datasets.layouts.registry import get_layout, list_layouts
 from brainbench.datasets.sessions import Series, make_session
-from tests.factories.recording_files import ROWS, detection, write_rodgers
-from tests.factories.recordings import LABELS
+from tests.factories.recordings import LABELS, ROWS, detection, write_rodgers
 
 
 def one(index, value, other):

@@ -6,8 +6,7 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import check, export, inspect, open_recordings, write_recordings
 from brainbench.datasets.sessions import make_session
 from brainbench.datasets.trials.signals import fading, time_lost
-from tests.factories.recording_files import write_nwb
-from tests.factories.recordings import make_simple_session
+from tests.factories.recordings import make_simple_session, write_nwb
 
 SERIES = "processing/ophys/DfOverF/dff"
 

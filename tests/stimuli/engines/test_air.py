@@ -14,8 +14,7 @@ from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.scenes.scene_files import load_scene
 from brainbench.stimuli.simulation import simulate
 from brainbench.stimuli.whiskers.whisker import Whisker
-from tests.factories.engine_scenes import post
-from tests.factories.whiskers import NEEDLE, H
+from tests.factories.engine_scenes import NEEDLE, H, post
 
 CYLINDER = Whisker(0.02, 4e-5, 4e-5, 3e9, 1300.0, 1.0)
 CALM = replace(H, damping_ratio=1.0)

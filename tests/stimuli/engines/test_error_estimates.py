@@ -27,7 +27,7 @@ from brainbench.stimuli.motion.trajectories import ArrayFollicle, Translation, W
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle, Sphere
 from brainbench.stimuli.objects.solid import PlacedObject, sphere
 from tests.factories.contact_scenes import HARD_OBJECTS, contact_jobs
-from tests.factories.whiskers import C2
+from tests.factories.engine_scenes import C2
 
 RAT = replace(WhiskerArray.of("rat")["C2"].whisker, curvature=0.0, friction=0.0)
 TIMES = np.arange(1, 101) * 1e-3

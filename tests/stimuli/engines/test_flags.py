@@ -15,8 +15,8 @@ from brainbench.stimuli.engines.trust import GAVE_WAY, LARGEST_OVERLAP, LARGEST_
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle, Sphere
 from tests.factories.contact_scenes import contact_jobs, difference
+from tests.factories.engine_scenes import C2
 from tests.factories.engines import facts
-from tests.factories.whiskers import C2
 
 pytest.importorskip("warp")
 

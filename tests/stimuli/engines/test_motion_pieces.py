@@ -13,8 +13,7 @@ from brainbench.stimuli.engines.stepping import SteppedJob
 from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.motion.trajectories import Whisking
 from brainbench.stimuli.objects.obstacle import Obstacle, Sphere
-from tests.factories.engine_scenes import FLAT, Oscillation
-from tests.factories.whiskers import C2
+from tests.factories.engine_scenes import C2, FLAT, Oscillation
 
 
 def _cut(motion, stop=0.05, *, step=1e-4, finest=None):

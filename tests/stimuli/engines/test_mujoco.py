@@ -18,8 +18,7 @@ from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.motion.trajectories import Still, Translation
 from brainbench.stimuli.objects.obstacle import ConvexPart
 from brainbench.stimuli.whiskers.whisker import build_chain
-from tests.factories.engine_scenes import Oscillation, post
-from tests.factories.whiskers import C2
+from tests.factories.engine_scenes import C2, Oscillation, post
 
 COARSE = Fidelity(links=8, time_step=1e-4)
 

@@ -17,8 +17,7 @@ from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylind
 from brainbench.stimuli.validation import bench_tests
 from brainbench.stimuli.validation.bench_tests import ringdown
 from brainbench.stimuli.whiskers.whisker import build_chain
-from tests.factories.engine_scenes import Swing, post
-from tests.factories.whiskers import C2
+from tests.factories.engine_scenes import C2, Swing, post
 
 CRITICAL = replace(C2, damping_ratio=1.0)
 

@@ -12,7 +12,7 @@ from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod.engine import RodEngine
 from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle, Sphere
-from tests.factories.whiskers import C2
+from tests.factories.engine_scenes import C2
 
 pytest.importorskip("warp")
 

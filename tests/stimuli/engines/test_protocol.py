@@ -11,7 +11,7 @@ from brainbench.stimuli.engines import get_engine, list_engines
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.jobs import MICRO, MILLI, Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Obstacle, Sphere
-from tests.factories.whiskers import C2
+from tests.factories.engine_scenes import C2
 
 
 def test_force_is_mass_times_acceleration():

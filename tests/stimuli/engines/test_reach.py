@@ -12,7 +12,7 @@ from brainbench.stimuli.engines.reach import reachable, stays_in_plane
 from brainbench.stimuli.engines.rod.engine import RodEngine
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Cylinder, Obstacle, Sphere
-from tests.factories.whiskers import H
+from tests.factories.engine_scenes import H
 
 CURVED = replace(H, curvature=20.0)
 TIMES = np.linspace(0, 0.02, 21)

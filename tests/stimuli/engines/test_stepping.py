@@ -11,7 +11,7 @@ from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Cylinder, Obstacle, Sphere
 from tests.factories.contact_scenes import contact_jobs
-from tests.factories.whiskers import C2
+from tests.factories.engine_scenes import C2
 
 ESTIMATED = get_engine("mujoco", errors=True)
 

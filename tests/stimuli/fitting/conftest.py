@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from brainbench.stimuli.fitting import Trial, fit
-from tests.factories.fitted_ringdown import KNOWN, QUICK, ringdown_shapes, ringdown_wrenches, simulate_ringdown
+from tests.factories.whisker_measurements import KNOWN, QUICK, ringdown_shapes, ringdown_wrenches, simulate_ringdown
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from brainbench.stimuli import WhiskerArray
-from tests.factories.fitted_ringdown import write_ringdown
+from tests.factories.whisker_measurements import write_ringdown
 from tests.factories.whisker_tracks import write_points
 
 WHISKER = WhiskerArray.of("mouse")["C2"].whisker

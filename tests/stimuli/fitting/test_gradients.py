@@ -26,9 +26,8 @@ from brainbench.stimuli.fitting.gradients import (
 from brainbench.stimuli.fitting.recorded_run import RecordingSolver
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Cylinder, Obstacle, Sphere
-from tests.factories.contact_scenes import contact_jobs, meshed
+from tests.factories.contact_scenes import contact_jobs, held_job, meshed, sliding_job
 from tests.factories.gradients import COARSE, WHISKER, Swing, gradient_errors, touching_job, traces_at
-from tests.factories.pressed_whiskers import held_job, sliding_job
 
 POST = Capsule((11e-3, 2.2e-3, -8e-3), (11e-3, 2.7e-3, 8e-3), 5e-4)
 

@@ -13,8 +13,16 @@ from brainbench.stimuli.fitting import Trial, fit
 from brainbench.stimuli.fitting.least_squares import Profile, laplace_interval, quantile
 from brainbench.stimuli.fitting.model import FitModel
 from brainbench.stimuli.fitting.parameters import Condition, FreeParameters
-from tests.factories.fitted_ringdown import KNOWN, QUICK, TRUTH, ringdown_shapes, ringdown_wrenches
-from tests.factories.whisker_measurements import blank_wrenches, measure_wrenches, simulate_trial
+from tests.factories.whisker_measurements import (
+    KNOWN,
+    QUICK,
+    TRUTH,
+    blank_wrenches,
+    measure_wrenches,
+    ringdown_shapes,
+    ringdown_wrenches,
+    simulate_trial,
+)
 
 FREE = FreeParameters(("young_modulus", "damping_ratio"), Condition(WhiskerArray.of("mouse")["C2"].whisker))
 LIMITS = (np.full(2, -3.0), np.full(2, 3.0))

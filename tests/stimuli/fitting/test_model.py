@@ -11,8 +11,15 @@ from brainbench.stimuli import WhiskerArray, references
 from brainbench.stimuli.fitting import FitOptions, Trial, fit
 from brainbench.stimuli.fitting.model import FitModel, find_starts
 from brainbench.stimuli.fitting.parameters import FreeParameters, Prior
-from tests.factories.fitted_ringdown import KNOWN, QUICK, ringdown_shapes, ringdown_wrenches
-from tests.factories.whisker_measurements import blank_wrenches, measure_wrenches, simulate_trial
+from tests.factories.whisker_measurements import (
+    KNOWN,
+    QUICK,
+    blank_wrenches,
+    measure_wrenches,
+    ringdown_shapes,
+    ringdown_wrenches,
+    simulate_trial,
+)
 
 LIVELY = replace(WhiskerArray.of("mouse")["C2"].whisker, damping_ratio=0.05)
 PERIOD = 1 / float(references.natural_frequencies(LIVELY, 1)[0])

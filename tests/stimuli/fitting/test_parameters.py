@@ -20,9 +20,8 @@ from brainbench.stimuli.fitting.parameters import (
 )
 from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle, Sphere
-from tests.factories.fitted_ringdown import KNOWN
 from tests.factories.gradients import WHISKER, Swing, gradient_errors, touching_job
-from tests.factories.whisker_measurements import blank_wrenches
+from tests.factories.whisker_measurements import KNOWN, blank_wrenches
 
 PART = Capsule((0.0, 0.0, -1e-3), (2e-3, 0.0, 3e-3), 2e-4)
 

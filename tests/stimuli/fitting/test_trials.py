@@ -17,8 +17,13 @@ from brainbench.stimuli.fitting import FitOptions, Trial, fit, new_shapes, new_w
 from brainbench.stimuli.fitting.model import Readings
 from brainbench.stimuli.fitting.parameters import Condition
 from brainbench.stimuli.fitting.trials import Pluck, to_frame
-from tests.factories.fitted_ringdown import KNOWN, ringdown_wrenches
-from tests.factories.whisker_measurements import blank_wrenches, measure_wrenches, simulate_trial
+from tests.factories.whisker_measurements import (
+    KNOWN,
+    blank_wrenches,
+    measure_wrenches,
+    ringdown_wrenches,
+    simulate_trial,
+)
 
 
 def test_the_direction_of_a_pluck_has_no_length():

@@ -5,7 +5,7 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
-from tests.factories.whiskers import C2
+from tests.factories.engine_scenes import C2
 
 
 def test_no_frame_lies_before_the_start():

@@ -17,7 +17,7 @@ from brainbench.stimuli.validation.bench_tests import PointLoad, ringdown
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from brainbench.stimuli.whiskers.whisker import Whisker
 from tests.factories.contact_scenes import HARD_OBJECTS, contact_jobs, difference
-from tests.factories.whiskers import C2, RAT
+from tests.factories.engine_scenes import C2, RAT
 
 
 def _gate_whiskers() -> dict[str, Whisker]:

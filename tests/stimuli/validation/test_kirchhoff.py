@@ -9,8 +9,8 @@ import pytest
 from brainbench.core.errors import DataError
 from brainbench.stimuli.validation import references
 from brainbench.stimuli.whiskers.array import WhiskerArray
+from tests.factories.engine_scenes import H
 from tests.factories.kirchhoff import KirchhoffRod, load_rod, press_rod
-from tests.factories.whiskers import H
 
 
 def test_a_quarter_circle_yields_to_a_force_across_its_plane_by_bending_and_twist():

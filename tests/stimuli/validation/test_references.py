@@ -9,7 +9,7 @@ from scipy.integrate import quad
 
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.validation import references
-from tests.factories.whiskers import C2, H
+from tests.factories.engine_scenes import C2, H
 
 
 @pytest.mark.parametrize(

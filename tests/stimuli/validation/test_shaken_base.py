@@ -19,7 +19,7 @@ from brainbench.stimuli.motion.trajectories import smooth_step
 from brainbench.stimuli.validation import references
 from brainbench.stimuli.validation.references import beam_matrices
 from brainbench.stimuli.whiskers.whisker import Whisker
-from tests.factories.whiskers import C2, H
+from tests.factories.engine_scenes import C2, H
 
 _MODES = 40
 """Modes of the beam; their highest lies above 100 kHz for all published whiskers."""

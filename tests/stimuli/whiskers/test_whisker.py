@@ -18,7 +18,7 @@ from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.validation.references import natural_frequencies
 from brainbench.stimuli.whiskers.whisker import FollicleSprings, Whisker, build_chain
-from tests.factories.whiskers import C2, NEEDLE, H
+from tests.factories.engine_scenes import C2, NEEDLE, H
 
 
 def _make_whisker(**changes):

@@ -13,8 +13,18 @@ from robotics_bridge.sensors.audio.runtime import Microphone, joint_drive
 from robotics_bridge.sensors.audio.sensors import ActuationAudio, ContactAudio, Modes
 from robotics_bridge.sensors.noise.model import Noise
 from robotics_bridge.sensors.suite import SensorSuite
-from tests.factories.struck_box import DT, MODES, RATE, K, box_scene, make_box, strike, touch_box
-from tests.factories.touch_scenes import ball_state, suite_of
+from tests.factories.touch_scenes import (
+    DT,
+    MODES,
+    RATE,
+    K,
+    ball_state,
+    box_scene,
+    make_box,
+    strike,
+    suite_of,
+    touch_box,
+)
 
 
 def test_what_is_held_at_a_reset_makes_no_sound_and_what_strikes_afterwards_does():

@@ -13,8 +13,7 @@ from robotics_bridge.sensors.audio.modes import find_modes
 from robotics_bridge.sensors.audio.runtime import Microphone, joint_drive
 from robotics_bridge.sensors.audio.sensors import ActuationAudio, ContactAudio, Modes
 from robotics_bridge.sensors.suite import SensorSuite
-from tests.factories.struck_box import DT, MODES, RATE, K, box_scene, make_box, strike, touch_box
-from tests.factories.touch_scenes import require_processor
+from tests.factories.touch_scenes import DT, MODES, RATE, K, box_scene, make_box, require_processor, strike, touch_box
 
 
 def test_an_impact_rings_as_the_sum_of_damped_modes():

@@ -31,8 +31,7 @@ from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylind
 from brainbench.stimuli.scenes.scene import Frames
 from brainbench.stimuli.validation import bench_tests
 from brainbench.stimuli.whiskers.whisker import Whisker, build_chain
-from tests.factories.engine_scenes import Swing, post
-from tests.factories.whiskers import C2
+from tests.factories.engine_scenes import C2, Swing, post
 
 needs_bullet = pytest.mark.skipif(find_spec("pybullet") is None, reason="PyBullet is made for Python below 3.12")
 COARSE = Fidelity(links=8, time_step=2e-4)

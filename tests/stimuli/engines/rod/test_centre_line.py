@@ -11,11 +11,10 @@ from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
-from tests.factories.contact_scenes import HARD_OBJECTS, contact_jobs, difference, meshed
+from tests.factories.contact_scenes import HARD_OBJECTS, contact_jobs, difference, held_job, meshed, sliding_job
+from tests.factories.engine_scenes import C2
 from tests.factories.gradients import touching_job
-from tests.factories.pressed_whiskers import held_job, sliding_job
 from tests.factories.rod_chain import in_double
-from tests.factories.whiskers import C2
 
 wp = pytest.importorskip("warp")
 

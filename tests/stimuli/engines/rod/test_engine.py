@@ -22,7 +22,7 @@ from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
 from brainbench.stimuli.validation import bench_tests
 from brainbench.stimuli.whiskers.whisker import build_chain
-from tests.factories.whiskers import C2
+from tests.factories.engine_scenes import C2
 
 pytest.importorskip("warp")
 

@@ -17,7 +17,7 @@ from brainbench.stimuli.objects.procedural import make
 from brainbench.stimuli.objects.solid import shape_solid
 from brainbench.stimuli.sweeps.plan import simulate_sweeps
 from brainbench.stimuli.sweeps.sweep_scenes import SweepGrid, SweepScenes
-from tests.factories.whiskers import C2
+from tests.factories.engine_scenes import C2
 
 pytest.importorskip("warp")
 

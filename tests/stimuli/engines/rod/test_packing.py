@@ -28,8 +28,8 @@ from brainbench.stimuli.engines.rod.packing import (
 from brainbench.stimuli.motion.jobs import StillFollicle
 from brainbench.stimuli.scenes.recipes import get_recipe
 from brainbench.stimuli.whiskers.whisker import build_chain, quadrature
+from tests.factories.engine_scenes import C2
 from tests.factories.gradients import Swing
-from tests.factories.whiskers import C2
 
 wp = pytest.importorskip("warp")
 
