@@ -13,8 +13,8 @@ from brainbench.metrics.reliability.subject_rdm import SubjectRDM, subject_rdm
 STIMULI = ("convex-close", "convex-medium", "convex-far", "concave-close", "concave-medium", "concave-far")
 
 
-def make_latent(seed=0, stimuli=6, dims=4):
-    return np.random.default_rng(seed).normal(size=(stimuli, dims))
+def make_latent(seed=0, stimuli=6):
+    return np.random.default_rng(seed).normal(size=(stimuli, 4))
 
 
 def make_block(latent, seed=0, units=20, repeats=8, noise=1.0, keys=True, gap=()):
@@ -36,22 +36,22 @@ def make_subject(name, brain_rdm, reliability=0.9, splits=20, seed=0, **extra):
     return SubjectRDM(name, brain_rdm, r - r.mean() + half, halves, 10, 60, reliability=found, **extra)
 
 
-def make_rdm(rng, stimuli=6, units=12):
+def make_rdm(rng, stimuli=6):
     """The RDM of unrelated patterns."""
-    return rdm(rng.normal(size=(stimuli, units)))
+    return rdm(rng.normal(size=(stimuli, 12)))
 
 
-def make_animals(latent, count=6, noise=2.0, seed=100, splits=60):
+def make_animals(latent, count=6, noise=2.0):
     """Animals whose units are tuned at random to one latent geometry."""
     return [
-        subject_rdm(f"m{i}", [make_block(latent, seed=seed + i, noise=noise)], len(latent), splits=splits)
+        subject_rdm(f"m{i}", [make_block(latent, seed=100 + i, noise=noise)], len(latent), splits=60)
         for i in range(count)
     ]
 
 
-def make_layers(latent, count=4, seed=50):
+def make_layers(latent, count=4):
     """RDMs of layers, each nearer to the latent geometry than the one before."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(50)
     return {f"conv{i}": rdm(np.c_[latent * i, rng.normal(size=(len(latent), 6))]) for i in range(count)}
 
 

@@ -7,17 +7,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-SHAPES = {
-    "box": lambda half: f'type="box" size=".007 {half} .006" pos="0 {half} 0"',
-    "capsule": lambda half: f'type="capsule" size=".007" fromto="0 .004 0 0 {2 * half} 0"',
-    "cylinder": lambda half: f'type="cylinder" size=".007 {half}" pos="0 {half} 0" euler="1.5708 0 0"',
-    "ellipsoid": lambda half: f'type="ellipsoid" size=".008 {half} .008" pos="0 {half} 0"',
-    "mesh": lambda half: f'type="mesh" mesh="phalanx" pos="0 {half} 0"',
-    "soft": lambda half: (
-        f'type="capsule" size=".007" fromto="0 .004 0 0 {2 * half} 0" solref=".02 1" solimp=".6 .95 .01"'
-    ),
-}
-MESH = '<asset><mesh name="phalanx" vertex="-.007 -.015 -.006 .007 -.015 -.006 -.007 .015 -.006 .007 .015 -.006 -.005 -.015 .006 .005 -.015 .006 -.005 .013 .006 .005 .013 .006"/></asset>'
+BOX = 'type="box" size=".007 .015 .006" pos="0 .015 0"'
+CAPSULE = 'type="capsule" size=".007" fromto="0 .004 0 0 .03 0"'
 
 
 @dataclass(frozen=True)
@@ -39,13 +30,13 @@ class Model:
         return path
 
 
-def finger(name: str, place: str, shape: str = "box", links: int = 2, more: str = "") -> str:
-    """Return a finger of hinges that bend up; ``more`` stands in its last link."""
+def finger(name: str, place: str, shape: str = BOX, links: int = 2, more: str = "") -> str:
+    """Return a finger of hinges that bend up; ``shape`` is that of its links, ``more`` stands in the last."""
     text, parts = "", [f"{name}{index}" for index in range(links - 1)] + [f"{name}_tip"]
     for index, part in enumerate(parts):
         at = place if index == 0 else "0 .036 0"
         text += f'<body name="{part}" pos="{at}"><joint name="{part}" axis="1 0 0" range="0 1.5" damping=".01"/>'
-        text += f'<geom {SHAPES[shape](0.015)} mass=".02"/>'
+        text += f'<geom {shape} mass=".02"/>'
     return text + more + "</body>" * links
 
 
@@ -54,13 +45,13 @@ def palm(fingers: str, name: str = "palm", place: str = "0 0 .2", more: str = ""
     return f'<body name="{name}" pos="{place}">{more}<geom type="box" size=".04 .03 .01" mass=".3"/>{fingers}</body>'
 
 
-def mjcf(bodies: str, *, parts: str = "", mesh: bool = False) -> str:
+def mjcf(bodies: str, *, parts: str = "") -> str:
     """Return a file of bodies and further parts."""
-    head = '<mujoco><compiler angle="radian" autolimits="true"/>' + (MESH if mesh else "")
+    head = '<mujoco><compiler angle="radian" autolimits="true"/>'
     return f"{head}<worldbody>{bodies}</worldbody>{parts}</mujoco>"
 
 
-def hand(count: int, shape: str = "box", links: int = 2, prefix: str = "") -> tuple[str, tuple[str, ...]]:
+def hand(count: int, shape: str = BOX, links: int = 2, prefix: str = "") -> tuple[str, tuple[str, ...]]:
     """Return the fingers of a hand side by side, and their tips."""
     names = [f"{prefix}f{index}" for index in range(count)]
     spread = [f"{0.02 * (index - (count - 1) / 2):.4f} .03 0" for index in range(count)]
@@ -105,7 +96,6 @@ LOOPS = "".join(
 COUPLED = '<joint joint1="left_crank" joint2="right_crank"/>'
 TENDON = '<tendon><fixed name="split"><joint joint="{0}" coef=".5"/><joint joint="{1}" coef=".5"/></fixed></tendon>'
 GRIP = '<actuator><general name="grip" tendon="split" ctrlrange="0 255" gainprm=".03" biastype="affine" biasprm="0 -16 -.6"/></actuator>'
-JAWS = ("left_jaw", "right_jaw")
 
 
 def urdf(mimic: bool) -> str:
@@ -127,66 +117,34 @@ def _solid(size: str, mass: float, at: str = "0 0 0") -> str:
     return f'{inertia}<collision><origin xyz="{at}"/><geometry><box size="{size}"/></geometry></collision>'
 
 
-def arm(tool: str) -> str:
-    """Return an arm of three hinges that carries a tool."""
-    text = ""
-    for index, axis in enumerate(("0 0 1", "0 1 0", "0 1 0")):
-        text += f'<body name="arm{index}" pos="0 0 .3"><joint name="arm{index}" axis="{axis}" range="-2 2"/>'
-        text += '<geom type="capsule" size=".03" fromto="0 0 0 0 0 .25" mass="1"/>'
-    return text + tool + "</body>" * 3
-
-
-def gallery() -> dict[str, Model]:
-    """Return the models by name."""
+def _gallery() -> dict[str, Model]:
+    """Return models that several tests look at, by name; ``tests/robotics_bridge/hands/test_gallery.py`` has more."""
     models: dict[str, Model] = {}
-    for shape in SHAPES:
-        fingers, tips = hand(3, shape)
-        models[f"three-fingers-{shape}"] = Model(mjcf(palm(fingers), mesh=shape == "mesh"), tips, drives=6)
-    for count, links in ((2, 3), (4, 3), (5, 3)):
-        fingers, tips = hand(count, "capsule", links)
-        models[f"{count}-fingers"] = Model(mjcf(palm(fingers)), tips, drives=count * links)
-    fingers, tips = hand(5, "capsule", 3)
+    fingers, tips = hand(3)
+    models["three-fingers-box"] = Model(mjcf(palm(fingers)), tips, drives=6)
+    fingers, tips = hand(5, CAPSULE, 3)
     follow = "".join(f'<joint joint1="{tip}" joint2="{tip[:-4]}1" polycoef="0 .8 0 0 0"/>' for tip in tips)
     models["mimic-hand"] = Model(mjcf(palm(fingers), parts=f"<equality>{follow}</equality>"), tips, drives=10)
-    fork = finger("fork", "0 .03 0", more=finger("a", "-.01 .036 0") + finger("b", ".01 .036 0"))
-    models["forked-finger"] = Model(mjcf(palm(finger("f", "-.03 .03 0") + fork)), ("f_tip", "a_tip", "b_tip"))
-    models["floating"] = Model(mjcf(palm(fingers, more="<freejoint/>")), tips)
-    models["hand-on-arm"] = Model(mjcf(arm(palm(fingers, place="0 0 .26"))), tips)
-    pair = [hand(3, "box", 2, side) for side in ("l", "r")]
-    two = palm(pair[0][0], "left_palm", "-.1 0 .2") + palm(pair[1][0], "right_palm", ".1 0 .2")
-    models["two-hands"] = Model(mjcf(two), pair[0][1], ("left_palm", "right_palm"))
-    five = [hand(5, "capsule", 2, side) for side in ("l", "r")]
-    arms = "".join(
-        f'<body name="{side}_shoulder" pos="{x} 0 .4"><joint name="{side}_shoulder" axis="0 1 0" range="-1 1"/>'
-        f'<geom type="capsule" size=".03" fromto="0 0 0 0 0 .3" mass="1"/>{palm(f[0], f"{side}_palm", "0 0 .35")}</body>'
-        for side, x, f in zip("lr", (-0.3, 0.3), five, strict=True)
-    )
-    head = '<body name="head" pos="0 0 .5"><joint axis="0 0 1" range="-1 1"/><geom size=".08" mass="1"/></body>'
-    torso = f'<body name="torso"><geom type="box" size=".1 .1 .3" mass="9"/>{head}{arms}</body>'
-    models["torso"] = Model(mjcf(torso), five[0][1], ("l_palm", "r_palm"))
-    for joint in ("slide", "hinge"):
-        models[f"jaws-{joint}"] = Model(mjcf(palm(jaws(joint))), ("left", "right"), drives=2)
-    split = TENDON.format("left", "right")
-    models["tendon-jaws"] = Model(mjcf(palm(jaws()), parts=split + GRIP), ("left", "right"), drives=1)
+    (left, tips), (right, _) = (hand(3, prefix=side) for side in ("l", "r"))
+    two = palm(left, "left_palm", "-.1 0 .2") + palm(right, "right_palm", ".1 0 .2")
+    models["two-hands"] = Model(mjcf(two), tips, ("left_palm", "right_palm"))
+    models["jaws-slide"] = Model(mjcf(palm(jaws())), ("left", "right"), drives=2)
     one = '<actuator><position joint="left" kp="500" kv="10"/></actuator><equality><joint joint1="right" joint2="left"/></equality>'
     models["coupled-jaws"] = Model(mjcf(palm(jaws()), parts=one), ("left", "right"), drives=1)
-    models["jaws-on-arm"] = Model(mjcf(arm(palm(jaws(), place="0 0 .26"))), ("left", "right"))
-    models["urdf-jaws"] = Model(urdf(False), ("left", "right"), suffix=".urdf", drives=2)
     models["urdf-mimic"] = Model(urdf(True), ("left", "right"), suffix=".urdf")
-    split = TENDON.format("left_crank", "right_crank")
-    parts = f"{split}<equality>{LOOPS}{COUPLED}</equality>{GRIP}"
-    models["four-bar-tendon"] = Model(mjcf(palm(four_bar()), parts=parts), JAWS, couplers=4, drives=1)
-    parts = f"<equality>{LOOPS}</equality>" + "".join(
+    servos = "".join(
         f'<actuator><position joint="{side}_crank" kp="5" kv=".1"/></actuator>' for side in ("left", "right")
     )
-    models["four-bar-servos"] = Model(mjcf(palm(four_bar()), parts=parts), JAWS, couplers=4, drives=2)
-    models["four-bar-passive"] = Model(
-        mjcf(palm(four_bar()), parts=f"<equality>{LOOPS}</equality>"), JAWS, couplers=4, drives=2
-    )
-    thumb = '<body name="thumb" pos="0 .03 0"><joint name="thumb" axis="1 0 0" range="0 1.5"/>'
-    thumb += '<geom type="box" size=".01 .02 .005" pos="0 .02 0" mass=".02"/></body>'
-    models["single-jaw"] = Model(mjcf(palm(thumb)), ("thumb",), drives=1)
+    split = TENDON.format("left_crank", "right_crank")
+    for name, parts, drives in (
+        ("tendon", f"{split}<equality>{LOOPS}{COUPLED}</equality>{GRIP}", 1),
+        ("servos", f"<equality>{LOOPS}</equality>{servos}", 2),
+        ("passive", f"<equality>{LOOPS}</equality>", 2),
+    ):
+        models[f"four-bar-{name}"] = Model(
+            mjcf(palm(four_bar()), parts=parts), ("left_jaw", "right_jaw"), couplers=4, drives=drives
+        )
     return models
 
 
-GALLERY = gallery()
+GALLERY = _gallery()

@@ -72,7 +72,7 @@ from robotics_bridge.tasks.registry import apply_overrides
 from tests.factories.hand_gallery import GALLERY
 from tests.factories.policies import contract_of, student_folder
 from tests.factories.published_files import lightning_state, make_zero_filled, write_published, write_run, write_sweep
-from tests.factories.reading_trials import Surface, bad_counts, not_finite, numbers, typed, written, written_json
+from tests.factories.reading_trials import Surface, bad_counts, not_finite, numbers, written, written_json
 from tests.factories.recordings import make_simple_session, write_nwb
 from tests.factories.records import make_record
 from tests.factories.scene_files import POLE
@@ -391,10 +391,6 @@ def _bad_hand(values: Any) -> bool:
     return not_finite(values) or (values["body_mass"] < 0).any() or (values["geom_friction"] < 0).any()
 
 
-def _change(text: str) -> Any:
-    return apply_overrides(tasks.load("in_palm_rotate"), text.split())
-
-
 def _student(name: str) -> Any:
     return lambda folder: student_folder(folder) / name
 
@@ -413,6 +409,15 @@ def _key(folder: Path) -> Path:
 
 def _bad_contract(contract: PolicyContract) -> bool:
     return any(not math.isfinite(n) for n in numbers(contract)) or contract.rate <= 0
+
+
+def _typed(name: str, text: str, read: Any, faults: Any = not_finite) -> Surface:
+    """Return the surface of a text that a user types: any text, from a file whose damage may be no text at all."""
+
+    def read_file(path: Path) -> Any:
+        return read(path.read_bytes().decode(errors="replace")[:100_000] if path.is_file() else "")
+
+    return Surface(name, written(f"{name.partition(' ')[0]}.txt", text), read_file, faults)
 
 
 SURFACES = (
@@ -461,7 +466,7 @@ SURFACES = (
     Surface("training state", _training, _go_on, _bad_training),
     Surface("batch file", written("batch.toml", BATCH), read_batch),
     Surface("plan", _plan_file, _read_plan),
-    Surface("hub name", written("name.txt", "hf-hub:owner/model/inner@main"), typed(_ask_hub), _bad_order),
+    _typed("hub name", "hf-hub:owner/model/inner@main", _ask_hub, _bad_order),
     Surface("match, JSON", written_json("match.json", {"a": "b", "c": None}), read_match),
     Surface("match, CSV", written("match.csv", "a,b\nc,\n"), read_match),
     Surface(
@@ -482,30 +487,16 @@ SURFACES = (
         "commitment", written_json("held-out.json", Commitment("animals", 3, 8, "9f3c2a7be1d04455", "0f" * 32).plain),
         Commitment.read,
     ),
-    Surface(
-        "fidelity text", written("fidelity.txt", "fast,links=12,links_per_mm=0.3,time_step=1e-4,solver=quasistatic"),
-        typed(Fidelity.parse),
+    _typed("fidelity text", "fast,links=12,links_per_mm=0.3,time_step=1e-4,solver=quasistatic", Fidelity.parse),
+    _typed("selection text", "outcome=correct|error; units.layer=4; depth=1.5..20; min_spikes=50", Selection.parse),
+    _typed("seeds text", "0-4,7,9", parse_seeds, lambda seeds: min(seeds) < 0),
+    _typed("window text", "first-contact-0.1..choice+0.25", Window.parse),
+    _typed("trials text", "16-20", parse_trials, lambda rows: min(numbers(rows)) < 1),
+    _typed(
+        "whiskers text", "C1-C3,D*,*2", lambda text: WhiskerArray.mouse(whiskers=text), lambda array: not len(array)
     ),
-    Surface(
-        "selection text",
-        written("selection.txt", "outcome=correct|error; units.layer=4; depth=1.5..20; min_spikes=50"),
-        typed(Selection.parse),
-    ),
-    Surface("seeds text", written("seeds.txt", "0-4,7,9"), typed(parse_seeds), lambda seeds: min(seeds) < 0),
-    Surface("window text", written("window.txt", "first-contact-0.1..choice+0.25"), typed(Window.parse)),
-    Surface("trials text", written("trials.txt", "16-20"), typed(parse_trials), lambda rows: min(numbers(rows)) < 1),
-    Surface(
-        "whiskers text", written("whiskers.txt", "C1-C3,D*,*2"),
-        typed(lambda text: WhiskerArray.mouse(whiskers=text)), lambda array: not len(array),
-    ),
-    Surface(
-        "objects text", written("objects.txt", "torus:20"), typed(lambda text: resolve_objects([text])),
-        lambda objects: not objects,
-    ),
-    Surface(
-        "numbers text", written("numbers.txt", "0.5,1e-3,20"),
-        typed(lambda text: option_numbers(text, "--steps", float)),
-    ),
+    _typed("objects text", "torus:20", lambda text: resolve_objects([text]), lambda objects: not objects),
+    _typed("numbers text", "0.5,1e-3,20", lambda text: option_numbers(text, "--steps", float)),
     Surface("published recordings, npz", _recordings, open_recordings, bad_counts),
     Surface(
         "published sweep, npz", lambda folder: write_sweep(folder / "0.npz"), conversion.read_sweep,
@@ -519,11 +510,9 @@ SURFACES = (
     Surface("published weights, ckpt", _checkpoint, _import),
     Surface("published weights, imported", _checkpoint, _import_to_folder),
     Surface("published settings, YAML", written("config.yaml", SETTINGS), read_settings),
-    Surface("change text", written("change.txt", CHANGES), typed(_change)),
-    Surface(
-        "fault text",
-        written("fault.txt", "drop=0.2 jitter=0.03 silent-after=2 seed=3"),
-        typed(lambda text: Faults.parse(text.split())),
+    _typed("change text", CHANGES, lambda text: apply_overrides(tasks.load("in_palm_rotate"), text.split())),
+    _typed(
+        "fault text", "drop=0.2 jitter=0.03 silent-after=2 seed=3", lambda text: Faults.parse(text.split())
     ),
     Surface("hand, URDF", written("hand.urdf", GALLERY["urdf-mimic"].text), _read_hand, _bad_hand),
     Surface("hand, MJCF", written("hand.xml", GALLERY["coupled-jaws"].text), _read_hand, _bad_hand),

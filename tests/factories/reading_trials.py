@@ -184,12 +184,3 @@ def written(name: str, text: str) -> Callable[[Path], Path]:
 def written_json(name: str, value: Any) -> Callable[[Path], Path]:
     """Return what writes a value as JSON into a folder."""
     return lambda folder: write_json(folder / name, value)
-
-
-def typed(read: Callable[[str], Any]) -> Callable[[Path], Any]:
-    """Return the reader of an option that a user types: any text, from a file whose damage may be no text at all."""
-
-    def of(path: Path) -> Any:
-        return read(path.read_bytes().decode(errors="replace")[:100_000] if path.is_file() else "")
-
-    return of

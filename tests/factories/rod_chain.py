@@ -92,10 +92,6 @@ class DenseChain:
         """Which angles are hinges [link, hinge]."""
         return np.column_stack([np.ones((self.links, 2), dtype=bool), self.torsion > 0])[:, : self.hinges]
 
-    @property
-    def axes_count(self):
-        return np.count_nonzero(self.free)
-
     def arrays(self):
         """Return the fields of ``ChainArrays``, for one whisker."""
         n = self.links

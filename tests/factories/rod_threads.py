@@ -10,6 +10,7 @@ import re
 import sys
 import threading
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
 from types import FunctionType, ModuleType, SimpleNamespace
@@ -55,25 +56,19 @@ class ThreadWarp:
 
     def run(self, work, threads: int = WARP) -> None:
         """Call ``work(thread)`` in each thread; raise the first error of any."""
-        errors = []
 
         def go(thread: int) -> None:
             self._own.index = thread
             try:
                 work(thread)
-            except threading.BrokenBarrierError:
+            except threading.BrokenBarrierError:  # of another thread's error
                 pass
-            except (ArithmeticError, LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-                errors.append(error)
+            except BaseException:
                 self._meet.abort()
+                raise
 
-        together = [threading.Thread(target=go, args=(index,)) for index in range(threads)]
-        for thread in together:
-            thread.start()
-        for thread in together:
-            thread.join()
-        if errors:
-            raise errors[0]
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(go, range(threads)))
 
     def _exchange(self, value):
         index, caller = self._own.index, sys._getframe(2)

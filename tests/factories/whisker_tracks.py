@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import pickle
 import struct
 
 import h5py
@@ -10,8 +11,9 @@ import numpy as np
 import pandas as pd
 
 
-def bent_shapes(frames=12, points=10, length=0.015, *, bend=0.2, axes=2):
+def bent_shapes(frames=12, points=10, *, bend=0.2, axes=2):
     """Return shapes [frame, point, axis] (m) of a whisker that swings about its base at the origin."""
+    length = 0.015
     s = np.linspace(0, length, points)
     angle = 0.3 * np.sin(np.arange(frames) / 4)[:, None]
     y = bend * s**2 / length
@@ -22,14 +24,14 @@ def bent_shapes(frames=12, points=10, length=0.015, *, bend=0.2, axes=2):
     )
 
 
-def write_points(path, shapes, *, scale=5e-5, frames=None):
-    """Write a table of points in pixels, whose y runs down."""
+def write_points(path, shapes, *, frames=None):
+    """Write a table of points in pixels of 50 µm, whose y runs down."""
     with path.open("w", newline="") as stream:
         table = csv.writer(stream)
         table.writerow(["frame", "x", "y", "z"][: 1 + shapes.shape[-1]])
         for frame, shape in zip(frames or range(len(shapes)), shapes, strict=True):
             for point in shape:
-                cells = [*(point / scale)]
+                cells = [*(point / 5e-5)]
                 cells[1] = -cells[1]
                 table.writerow([frame, *("" if np.isnan(one) else f"{one:.6f}" for one in cells)])
     return path
@@ -46,16 +48,10 @@ def write_deeplabcut_csv(path, values, likelihood, *, individuals=None):
     return path
 
 
-def write_deeplabcut_table(path, values, likelihood, kind=None):
-    """Write DeepLabCut's HDF5 table as pandas does: the names stand in a pickle of protocol 0, or in ``kind``."""
+def write_deeplabcut_table(path, values, likelihood):
+    """Write DeepLabCut's HDF5 table as pandas does: the names stand in a pickle of protocol 0."""
     parts = [f"p{index}" for index in range(values.shape[1])]
-    if kind is None:
-        rows, memo = [], 1
-        for part in parts:
-            for coord in ("x", "y", "likelihood"):
-                rows.append(f"(Vnet\np{memo}\nV{part}\np{memo + 1}\nV{coord}\np{memo + 2}\ntp{memo + 3}\na")
-                memo += 4
-        kind = ("(lp0\n" + "".join(rows) + ".").encode()
+    kind = pickle.dumps([("net", part, coord) for part in parts for coord in ("x", "y", "likelihood")], protocol=0)
     block = np.concatenate([values, likelihood[..., None]], axis=-1).reshape(len(values), -1)
     table = np.zeros(len(values), dtype=[("index", "<i8"), ("values_block_0", "<f8", (block.shape[1],))])
     table["index"], table["values_block_0"] = np.arange(len(values)), block

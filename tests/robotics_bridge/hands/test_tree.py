@@ -40,12 +40,6 @@ def test_palmar_sides_of_a_hand_file_agree_with_where_its_probes_were_put(name, 
     assert active_count(layout) > 100
 
 
-@pytest.mark.parametrize("name", [name for name, model in GALLERY.items() if model.drives])
-def test_what_follows_is_not_driven(name: str, tmp_path) -> None:
-    hand = hands.load(GALLERY[name].write(tmp_path, name))
-    assert len(drives_of(hand)) == GALLERY[name].drives
-
-
 def test_a_tendon_drive_is_the_servo_of_its_first_joint(tmp_path) -> None:
     """Coefficients ½ and a gain of 16: 16 · ½ · 1 N·m/rad at the crank, as the tendon makes when both cranks turn."""
     hand = hands.load(GALLERY["four-bar-tendon"].write(tmp_path, "hand"))

@@ -107,7 +107,7 @@ def test_joints_accelerate_as_the_dense_equation_of_motion_says(beta, loaded, hi
     joints, wrench, tip = _passes(chain, given, load)
     dense, bias, (implicit, spring) = chain.mass_matrix(), chain.bias(), chain.implicit(STEP)
     nodes = chain.nodes
-    pushed = np.zeros(6 + chain.axes_count)
+    pushed = np.zeros(6 + np.count_nonzero(chain.free))
     if load is not None:
         point = nodes[load[0]] + load[1] * (nodes[load[0] + 1] - nodes[load[0]])
         pushed = chain.point_jacobian(point, load[0])[3:].T @ load[2]
