@@ -483,7 +483,7 @@ class _ForeignReader:
         """Run a model, give each call's first tensor away, and return how often each module was called."""
         counts: dict[str, int] = {}
 
-        def count(name: str, output: Any) -> None:
+        def _count(name: str, output: Any) -> None:
             index = counts[name] = counts.get(name, -1) + 1
             take(name, index, proof.first_tensor(output))
 
@@ -496,13 +496,13 @@ class _ForeignReader:
                     f"{type(answers).__name__}."
                 )
             for name in modules:
-                count(name, answers.get(name))
+                _count(name, answers.get(name))
             return dict.fromkeys(modules, 1)
         # A root's hook does not run for every kind of module, its result is here anyway.
-        with proof.hooks({name: module for name, module in modules.items() if module is not model}, count):
+        with proof.hooks({name: module for name, module in modules.items() if module is not model}, _count):
             output = self.run(model, part)
         if modules.get(OUTPUT) is model:
-            count(OUTPUT, output)
+            _count(OUTPUT, output)
         return {name: last + 1 for name, last in counts.items()}
 
     def _prove(self) -> _Sketches:
@@ -521,15 +521,15 @@ class _ForeignReader:
         proofs: dict[str, list[Any]] = {}
         sketched: dict[tuple[str, int, Layout], np.ndarray] = {}
 
-        def keep(tensor: torch.Tensor) -> Any:
+        def _keep(tensor: torch.Tensor) -> Any:
             self.held += tensor.nbytes
             return tensor if self.held <= self.rooms.memory // 8 else proof.spilled(tensor, files)
 
-        def capture(name: str, index: int, tensor: Any) -> None:
+        def _capture(name: str, index: int, tensor: Any) -> None:
             # A later operation in place must not change what was captured.
-            calls.setdefault(name, []).append(None if tensor is None else keep(tensor.cpu().clone()))
+            calls.setdefault(name, []).append(None if tensor is None else _keep(tensor.cpu().clone()))
 
-        def compare(name: str, index: int, tensor: Any) -> None:
+        def _compare(name: str, index: int, tensor: Any) -> None:
             first = calls[name][index] if index < len(calls.get(name, ())) else None
             result: Any = [], "gives no tensor of numbers"
             if first is not None and tensor is not None:
@@ -540,8 +540,8 @@ class _ForeignReader:
             proofs.setdefault(name, []).append(result)
 
         with ExitStack() as files:
-            self._forward(model, batches[0], capture)
-            self._forward(model, batches[1], compare)
+            self._forward(model, batches[0], _capture)
+            self._forward(model, batches[1], _compare)
             self.places, self.rooms.not_read, self.size = {}, {}, 1
             for name in [name for name in self.modules if name in calls or name in proofs]:
                 self.rooms.called.add(name)
@@ -604,12 +604,12 @@ class _ForeignReader:
         for part in np.array_split(picks, -(-len(picks) // _SAMPLED)) if len(picks) else ():
             rows = np.resize(part, max(len(part), self.fill))
 
-            def take(name: str, index: int, tensor: Any, rows: Any = rows) -> None:
+            def _take(name: str, index: int, tensor: Any, rows: Any = rows) -> None:
                 place = self.places.get((name, index))
                 if place is not None and tensor is not None and place.layout.fits(tuple(tensor.shape), len(rows)):
                     sketches.add(1, (place.layer, place.step), place.layout.split(tensor, len(rows)), rows)
 
-            self._forward(model, self.run.stimuli(rows), take)
+            self._forward(model, self.run.stimuli(rows), _take)
 
     def _run_all(self, chunk: int, sketches: _Sketches) -> None:
         """Run all stimuli once, and write what is a response."""
@@ -623,6 +623,7 @@ class _ForeignReader:
 
             def take(name: str, index: int, tensor: Any, part: Any = part, batch: Any = batch, loops: Any = loops,
                      missing: Any = missing) -> None:  # fmt: skip
+                """Write the rows of one call [B, …] where they are a response, and say why of what is not read."""
                 place = self.places.get((name, index))
                 if place is None:
                     rooms.called.add(name)

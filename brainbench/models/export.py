@@ -112,6 +112,7 @@ class _Part(nn.Module):
             self.shapes = tuple(tuple(item.shape[1:]) for item in pack(part.init_state(1)))
 
     def forward(self, x: torch.Tensor, state: _Tensors) -> tuple[torch.Tensor, _Tensors]:
+        """Return (y [B, F], the packed state after the step) of x [B, …] and packed states [B, …]."""
         y, after = self.part.step(x, self.unpack(state), **self.how)
         return y, self.pack(after)
 
@@ -121,14 +122,14 @@ def _graph_part(graph: TemporalGraph, unroll: Any) -> _Part:
     sources, empty = {edge.source for edge in graph.spec.edges}, graph.init_state(1)
     outputs = [name for name in empty.outputs if name in sources]
 
-    def pack(state: GraphState) -> _Tensors:
+    def _pack(state: GraphState) -> _Tensors:
         return [*(state.outputs[name] for name in outputs), *(state.memories[name] for name in empty.memories)]
 
-    def unpack(parts: _Tensors) -> GraphState:
+    def _unpack(parts: _Tensors) -> GraphState:
         memories = zip(empty.memories, parts[len(outputs) :], strict=True)
         return GraphState(dict(zip(outputs, parts, strict=False)), dict(memories))
 
-    return _Part(graph, pack, unpack, unroll=unroll)
+    return _Part(graph, _pack, _unpack, unroll=unroll)
 
 
 class _S4Part(nn.Module):
@@ -166,6 +167,7 @@ class _S4Part(nn.Module):
         return [System(*(getattr(self, f"{name}{number}") for name in System._fields)) for number in numbers]
 
     def forward(self, x: torch.Tensor, state: _Tensors) -> tuple[torch.Tensor, _Tensors]:
+        """Return (y [B, F], memories after the step) of x [B, …] and the memory of each block [B, …]."""
         # Weights that learn are discretised in every step, so that gradients reach them.
         learns = self.training or (torch.is_grad_enabled() and self.part.fc.weight.requires_grad)
         traced = torch.compiler.is_compiling() or torch.compiler.is_exporting()
@@ -187,6 +189,7 @@ class _GPTPart(nn.Module):
         self.shapes = ((1,), *(cache for _ in attender.blocks))
 
     def forward(self, x: torch.Tensor, state: _Tensors) -> tuple[torch.Tensor, _Tensors]:
+        """Return (y [B, F], state) of x [B, F]; NaN in rows of which more tokens came than the context holds."""
         attender = self.attender
         seen, caches = state[0], state[1:]
         slots = torch.arange(attender.context, device=x.device, dtype=seen.dtype)
@@ -421,12 +424,12 @@ def read_torch(path: str | Path) -> Callable[[Any, Any], tuple[Any, Any]]:
         warnings.simplefilter("ignore")
         module = torch.export.load(path).module()
 
-    def run(obs: Any, h_in: Any) -> tuple[Any, Any]:
+    def _run(obs: Any, h_in: Any) -> tuple[Any, Any]:
         with torch.no_grad():
             features, h_out = module(torch.from_numpy(obs), torch.from_numpy(h_in))
         return features.numpy(), h_out.numpy()
 
-    return run
+    return _run
 
 
 READERS = {"onnx": read_onnx, "torch": read_torch}  # readers of exported files, by format

@@ -103,13 +103,13 @@ def probes(stimuli: torch.Tensor, steps: int) -> dict[int, torch.Tensor]:
     size = values.square().mean((0, 1)).sqrt()
     size = size if bool(size.any()) else torch.ones_like(size)
 
-    def noise(length: int) -> torch.Tensor:
+    def _noise(length: int) -> torch.Tensor:
         return torch.randn((length, *size.shape), generator=generator, dtype=torch.float64) * size
 
-    base, pair = values[0] + noise(steps), values[-1] + noise(steps)
+    base, pair = values[0] + _noise(steps), values[-1] + _noise(steps)
     late, half = base.clone(), steps // 2
-    late[half:] += noise(steps - half)
-    head = noise(1)
+    late[half:] += _noise(steps - half)
+    head = _noise(1)
     shifted, pair_shifted = (torch.cat([head, row[:-1]]) for row in (base, pair))
     return {BASE: base, LATE: late, SHIFTED: shifted, PAIR: pair, PAIR_SHIFTED: pair_shifted}
 
@@ -190,11 +190,8 @@ def time_misfit(values: torch.Tensor) -> float:
     rows = (rows if rows.dtype == torch.float64 else rows.float()).nan_to_num(0.0, 0.0, 0.0)
     half, floor = values.shape[1] // 2, rounding(rows)
 
-    def moved(row: int) -> torch.Tensor:
-        return (rows[row] - rows[BASE]).abs().amax(-1)
-
-    late, early = moved(LATE), moved(SHIFTED)[:half]
-    if late[:half].max() <= max(1e-3 * float(late.max()), floor) < late[half:].max() and early.max() > floor:
+    late, early = ((rows[row] - rows[BASE]).abs().amax(-1) for row in (LATE, SHIFTED))
+    if late[:half].max() <= max(1e-3 * float(late.max()), floor) < late[half:].max() and early[:half].max() > floor:
         return 0.0
     # Of the difference between two probes, so that a code of the place in time, which does not shift, drops out, and
     # without what all entries share, since it tells nothing of time.

@@ -248,14 +248,14 @@ def register_model(
     """
     check_new_name(name)
 
-    def decorate(build: Factory) -> Factory:
+    def _decorate(build: Factory) -> Factory:
         if name in _records:
             owner = _records[name].build
             raise UsageError(f"A model named {name!r} is already registered by {owner!r}; choose another name.")
         _records[name] = ModelRecord(name, family, description, citation, licence, build)
         return build
 
-    return decorate
+    return _decorate
 
 
 def list_models(pattern: str = "*") -> list[str]:

@@ -101,14 +101,14 @@ def simulate(
 def read_entry(path: Path) -> xr.Dataset | None:
     """Return a stimulus set that the package or the cache keeps; None without one, or with a damaged one."""
 
-    def read(file: Path) -> xr.Dataset:
+    def _read(file: Path) -> xr.Dataset:
         state = file.stat()
         # A score asks for its stimuli twice, for the demo recordings and for the network.
         return _read_entry(file, state.st_size, state.st_mtime_ns).copy(deep=True)
 
     # The package's own entry goes first; a damaged one does not hide that of the cache.
     candidates = (
-        sealed.read_entry(file, "set of stimuli", read) for file in dict.fromkeys((find_entry(path) or path, path))
+        sealed.read_entry(file, "set of stimuli", _read) for file in dict.fromkeys((find_entry(path) or path, path))
     )
     return next((dataset for dataset in candidates if dataset is not None), None)
 
@@ -155,12 +155,12 @@ def _begin(
     if engine.smooth:
         fidelity = fidelity.touching(item.solid for scene in scenes for item in scene.objects)
 
-    def work() -> None:
+    def _work() -> None:
         # What is wrong here is wrong again in the simulation, which says so; Python refuses a pool when it ends.
         with contextlib.suppress(BrainbenchError, RuntimeError):
             engine.prepare(lengths, fidelity, progress=progress)
 
-    thread = threading.Thread(target=work, name=PREPARATION)
+    thread = threading.Thread(target=_work, name=PREPARATION)
     thread.start()
     return thread
 

@@ -191,13 +191,13 @@ class SafeLink:
         """
         ended = threading.Event()
 
-        def watch() -> None:
+        def _watch() -> None:
             while not ended.wait(SILENCE / 10):
                 with self._turn:
                     if self._overdue(self._clock()):
                         self._driver.stop()
 
-        thread = threading.Thread(target=watch, daemon=True) if type(self._clock) is Clock else None
+        thread = threading.Thread(target=_watch, daemon=True) if type(self._clock) is Clock else None
         if thread is not None:
             thread.start()
         try:

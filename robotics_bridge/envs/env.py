@@ -232,7 +232,7 @@ class Env:
                     f"received {shape}. Make the environments as those were."
                 )
 
-        def under(part: str) -> dict[str, torch.Tensor]:
+        def _under(part: str) -> dict[str, torch.Tensor]:
             return {name.removeprefix(part): value for name, value in values.items() if name.startswith(part)}
 
         if self.touch is not None and _NOISE_SEED in values:
@@ -240,9 +240,9 @@ class Env:
         for name, value in state.memory().items():
             value.copy_(values.get(name, value))
         state.generator.set_state(values["generator"].cpu())
-        state.simulation.restored(under("simulation."))
+        state.simulation.restored(_under("simulation."))
         state.started = True
-        state.observations = {name: value.to(state.device) for name, value in under("observations.").items()}
+        state.observations = {name: value.to(state.device) for name, value in _under("observations.").items()}
 
 
 class RslRlEnv:

@@ -14,6 +14,7 @@ import contextlib
 import gc
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import field
+from functools import partial
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -229,9 +230,7 @@ class Actuators:
         self.lever = torch.as_tensor(model.lever, dtype=torch.float32, device=device)
         """[J] factor on imperfections and noise that are stated for hinges."""
 
-        def zeros() -> torch.Tensor:
-            return torch.zeros(simulation.num_envs, len(ids), device=device)
-
+        zeros = partial(torch.zeros, simulation.num_envs, len(ids), device=device)
         names = ("stiffness", "damping", *_IMPERFECTIONS, "play", "before")
         self.values = {name: zeros() for name in names}
         """[B, J] gains and imperfections, and what the gears remember (as in ``ActuatorArrays``)."""
@@ -427,7 +426,7 @@ def warp_recorder(device: Any, generators: Sequence[torch.Generator]) -> Recorde
         generators: Random numbers that the work draws, beside torch's own on the device.
     """
 
-    def record(work: Callable[[], Any]) -> tuple[Any, Any]:
+    def _record(work: Callable[[], Any]) -> tuple[Any, Any]:
         wp = warp()
         where = wp.device_to_torch(device)
         # What Python throws away meanwhile could free device memory, which ends a recording.
@@ -451,7 +450,7 @@ def warp_recorder(device: Any, generators: Sequence[torch.Generator]) -> Recorde
             result = work()
         return _BetweenStreams(graph, external), result
 
-    return record
+    return _record
 
 
 class _BetweenStreams:

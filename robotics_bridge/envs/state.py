@@ -6,6 +6,7 @@ Letters: B environment, A action, J joint, F finger tip, K object, L tactile lin
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -29,9 +30,7 @@ class GoalState:
     """
 
     def __init__(self, task: Task, num_envs: int, device: torch.device, round_about: torch.Tensor) -> None:
-        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
-            return torch.zeros(num_envs, *shape, dtype=dtype, device=device)
-
+        zeros = partial(torch.zeros, num_envs, device=device)
         self.goal, self._dt = task.goal, task.step_dt
         self._round_about = round_about if self.goal is not None and self.goal.by_looks else None
         self._least = 0.0 if task.goal is None else task.goal.threshold
@@ -195,10 +194,7 @@ class EpisodeState:
         cls, num_envs: int, device: torch.device, *, actions: int, terms: int, rest: torch.Tensor
     ) -> EpisodeState:
         """Return the state before the first episode, with rest positions [J] as targets."""
-
-        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
-            return torch.zeros(num_envs, *shape, dtype=dtype, device=device)
-
+        zeros = partial(torch.zeros, num_envs, device=device)
         return cls(
             action=zeros(actions), last_action=zeros(actions), age=zeros(dtype=torch.long),
             steps=zeros(dtype=torch.long), returns=zeros(), reward_sums=zeros(terms), metric=zeros(), friction=zeros(),
@@ -243,13 +239,9 @@ class EnvState:
 
     def _index(self) -> None:
         """Set the constants of the task, and where its joints, objects and links stand in the physics."""
-
-        def floats(values: Any) -> torch.Tensor:
-            return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=self.device)
-
-        def integers(values: Any) -> torch.Tensor:
-            return torch.as_tensor(np.asarray(values, dtype=np.int64), device=self.device)
-
+        floats, integers = (
+            partial(torch.as_tensor, dtype=kind, device=self.device) for kind in (torch.float32, torch.long)
+        )
         model, first = self.model, self.simulation.model
         self.rows = torch.arange(self.num_envs, device=self.device)
         """[B] numbers of the environments, for indexing."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
@@ -472,10 +473,7 @@ class EpisodeReset:
         bodies = state.object_bodies.cpu().numpy()
         geoms = np.flatnonzero(np.isin(np.asarray(state.simulation.model.geom_bodyid), bodies))
         self._geoms = torch.as_tensor(geoms, device=state.device)
-
-        def floats(values: object) -> torch.Tensor:
-            return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=state.device)
-
+        floats = partial(torch.as_tensor, dtype=torch.float32, device=state.device)
         self._bottom = floats([shape.bottom for shape in state.model.shapes])[state.shape_of]
         self._grasps = None
         if state.task.starts == "grasps":

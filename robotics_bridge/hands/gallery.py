@@ -164,7 +164,7 @@ def draw(hand: Hand, layout: Layout, path: Path) -> None:
     model, data = hand.model, mujoco.MjData(hand.model)
     mujoco.mj_kinematics(model, data)
 
-    def world(link: str, points: Any) -> np.ndarray:
+    def _world(link: str, points: Any) -> np.ndarray:
         body = data.body(link)
         return 1e3 * (body.xpos + np.asarray(points) @ body.xmat.reshape(3, 3).T)
 
@@ -172,10 +172,10 @@ def draw(hand: Hand, layout: Layout, path: Path) -> None:
     for axis, (across, up) in zip(axes[0], ((0, 1), (0, 2)), strict=True):
         for number in range(1, model.nbody):
             if len(points := link_points(model, number)):
-                corners = world(model.body(number).name, points)
+                corners = _world(model.body(number).name, points)
                 axis.scatter(corners[:, across], corners[:, up], s=1, color="0.8", rasterized=True)
         for link, probes in layout.items():
-            places = world(link, probes.position[probes.active])
+            places = _world(link, probes.position[probes.active])
             axis.scatter(places[:, across], places[:, up], s=4)
         axis.set(xlabel=f"{'xyz'[across]} (mm)", ylabel=f"{'xyz'[up]} (mm)", aspect="equal")
     save_figure(figure, path)

@@ -208,13 +208,13 @@ def all_from_file(path: Path) -> tuple[Hand, ...]:
     if not branches:
         raise DataError(f"{str(path)!r} holds no hand: it has no joints.")
 
-    def names(bodies: Iterable[int]) -> tuple[str, ...]:
+    def _names(bodies: Iterable[int]) -> tuple[str, ...]:
         return tuple(model.body(body).name for body in bodies)
 
     (nested, jammed), hands = overlaps(model), []
     for hand in branches:
-        fingers = {model.body(tip).name: names(chain) for tip, chain in hand.fingers.items()}
-        couplers = frozenset(names(hand.couplers))
+        fingers = {model.body(tip).name: _names(chain) for tip, chain in hand.fingers.items()}
+        couplers = frozenset(_names(hand.couplers))
         name = path.stem if len(branches) == 1 else f"{path.stem}-{model.body(hand.palm).name}"
         hands.append(Hand(name, model.body(hand.palm).name, fingers, path, couplers=couplers, nested=nested))
         for doubt in doubts_of(model, hands[-1].links(), jammed):

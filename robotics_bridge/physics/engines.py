@@ -137,13 +137,13 @@ class MujocoEngine:
     def kinematics(self) -> None:
         """Refresh poses and velocities of the state at the current positions; contacts stay those of the last step."""
 
-        def work(env: int) -> None:
+        def _work(env: int) -> None:
             model, data = self.models[env], self.data[env]
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             mujoco.mj_comVel(model, data)
 
-        self._each(work)
+        self._each(_work)
 
     def step(self, steps: int = 1) -> None:
         """Advance every environment by so many steps and refresh the state."""
@@ -164,15 +164,15 @@ class MujocoEngine:
         """Do some work in every environment, by all threads, and refresh the state."""
         gather = self._gatherer.gather
 
-        def run(chunk: NDArray[np.int64]) -> None:
+        def _run(chunk: NDArray[np.int64]) -> None:
             for env in chunk.tolist():
                 work(env)
                 gather(env)
 
         if self._pool is None:
-            run(self._chunks[0])
+            _run(self._chunks[0])
         else:
-            list(self._pool.map(run, self._chunks))
+            list(self._pool.map(_run, self._chunks))
         self._gatherer.finish()
 
 
@@ -218,16 +218,16 @@ class _Gatherer:
         rows = np.concatenate([*(parts[6] for parts in contacts), np.zeros(1)])
         first = np.maximum(address, 0) + np.repeat(before[:-1], [len(parts[4]) for parts in contacts])
 
-        def row(offset: int, valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+        def _row(offset: int, valid: NDArray[np.bool_]) -> NDArray[np.float64]:
             return rows[np.where(valid & (address >= 0), first + offset, len(rows) - 1)]
 
         if self._model.opt.cone:
             # An elliptic cone has a row for the normal force, one for each tangent, and one for each torque.
-            normal, slip = row(0, dim > 0), np.stack([row(axis, axis < dim) for axis in range(1, 6)], axis=1)
+            normal, slip = _row(0, dim > 0), np.stack([_row(axis, axis < dim) for axis in range(1, 6)], axis=1)
         else:
             # A pyramid has two edges for each tangent (and for each torque): their sum is the normal force, their
             # difference by the coefficient the friction.
-            edges = np.stack([row(edge, edge < np.maximum(2 * (dim - 1), 1)) for edge in range(10)], axis=1)
+            edges = np.stack([_row(edge, edge < np.maximum(2 * (dim - 1), 1)) for edge in range(10)], axis=1)
             normal = edges.sum(axis=1)
             slip = np.where(np.arange(1, 6) < dim[:, None], cone * (edges[:, ::2] - edges[:, 1::2]), 0.0)
         # Along both tangents; about the normal and about both tangents.

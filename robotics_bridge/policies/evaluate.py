@@ -121,11 +121,9 @@ def agent(name: str, env: Env, *, seed: int = 0) -> Acting:
     generator = torch.Generator(device=env.device)
     generator.manual_seed(seed)
     still = torch.zeros(env.num_envs, env.num_actions, device=env.device)
-
-    def act(_: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        return still if name == "zero" else torch.randn(still.shape, generator=generator, device=env.device)
-
-    return act
+    if name == "zero":
+        return lambda _: still
+    return lambda _: torch.randn(still.shape, generator=generator, device=env.device)
 
 
 def forget(policy: Acting, where: torch.Tensor) -> None:

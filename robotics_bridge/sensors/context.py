@@ -27,7 +27,7 @@ def numbers_of(*configs: type) -> Callable[[type], type]:
     Numbers that may be None are left to the structure. Stands below ``@wp.struct``.
     """
 
-    def decorate(cls: type) -> type:
+    def _decorate(cls: type) -> type:
         numbers = {}
         for config in configs:
             stated = [field.name for field in fields(config) if field.name in get_annotations(config)]
@@ -36,7 +36,7 @@ def numbers_of(*configs: type) -> Callable[[type], type]:
         cls.__annotations__ = {**numbers, **get_annotations(cls)}
         return cls
 
-    return decorate
+    return _decorate
 
 
 def _dtype(annotation: Any) -> Any:

@@ -49,13 +49,13 @@ class ObjectShape:
     def scaled(self, factor: float) -> ObjectShape:
         """Return the shape with all lengths multiplied."""
 
-        def longer(lengths: tuple[float, ...]) -> Any:
+        def _longer(lengths: tuple[float, ...]) -> Any:
             return tuple(factor * one for one in lengths)
 
         # Lengths grow by the factor, the density stays: mass grows with its cube.
-        solids = tuple(replace(one, size=longer(one.size), position=longer(one.position)) for one in self.solids)
+        solids = tuple(replace(one, size=_longer(one.size), position=_longer(one.position)) for one in self.solids)
         name = f"{self.name}×{factor:.3g}"
-        return replace(self, name=name, solids=solids, extent=longer(self.extent), bottom=factor * self.bottom)
+        return replace(self, name=name, solids=solids, extent=_longer(self.extent), bottom=factor * self.bottom)
 
 
 def box(x: float, y: float, z: float) -> ObjectShape:

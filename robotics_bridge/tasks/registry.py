@@ -89,14 +89,14 @@ def register(name: str, config: str = "default") -> Callable[[Maker], Maker]:
             return Task(name="balance", ...)
     """
 
-    def keep(maker: Maker) -> Maker:
+    def _keep(maker: Maker) -> Maker:
         shipped = name in _SHIPPED and not maker.__module__.startswith("robotics_bridge.tasks.")
         if shipped or config in _MADE.get(name, {}):
             raise UsageError(f"There is a task {name!r} with a configuration {config!r} already; take another name.")
         _MADE.setdefault(name, {})[config] = maker
         return maker
 
-    return keep
+    return _keep
 
 
 def bounded(task: Task) -> Task:

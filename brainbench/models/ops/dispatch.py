@@ -181,6 +181,7 @@ class _WeightMatrix(torch.autograd.Function):
     def forward(
         ctx: Any, deferred: DeferredWeightGrad, weight: torch.Tensor, bias: torch.Tensor | None
     ) -> torch.Tensor:
+        """Return the weights [O, C, kernel] as the matrix that unfolded columns are multiplied with."""
         ctx.deferred, ctx.shape = deferred, weight.shape
         ctx.set_materialize_grads(False)
         return matrix_of(weight)
@@ -188,6 +189,7 @@ class _WeightMatrix(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *unused: Any) -> Any:
+        """Return the gradients of weights and bias, each the sum over all steps."""
         outputs, channels, rows, columns = ctx.shape
         weight, bias = ctx.deferred.collect()
         if weight is not None:
@@ -200,6 +202,7 @@ class _Convolution(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, deferred: DeferredWeightGrad, matrix: torch.Tensor, *inputs: torch.Tensor) -> torch.Tensor:
+        """Return maps [B, O, H, W] of inputs [B, C, H, W] whose channels are joined; their columns are kept."""
         columns = unfolded(inputs, deferred.geometry, deferred.reserve(len(inputs[0])))
         ctx.deferred, ctx.span = deferred, deferred.span
         ctx.inputs = [(x.shape[1], x.dtype) for x in inputs]
@@ -208,6 +211,7 @@ class _Convolution(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *given: Any) -> Any:
+        """Return the gradients of the inputs alone; that of the weights waits for the last step."""
         deferred: DeferredWeightGrad = ctx.deferred
         place = deferred.gradient(ctx.span)
         gradient = given[0] if place is None else _maps(place, deferred.geometry)
@@ -311,6 +315,7 @@ class _NormWeights(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, deferred: DeferredNormGrad, *weights: torch.Tensor) -> torch.Tensor:
+        """Return [2 · norms, C] in single precision: the scales, then the shifts."""
         ctx.deferred, ctx.kinds = deferred, [weight.dtype for weight in weights]
         ctx.set_materialize_grads(False)
         return torch.stack([weight.detach().float() for weight in weights])
@@ -318,6 +323,7 @@ class _NormWeights(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *unused: Any) -> Any:
+        """Return the gradient [C] of each scale and shift, summed over steps."""
         # Programs left their sums apart: added here in one order, results do not differ from run to run.
         sums = ctx.deferred.sums.sum(0)
         return None, *(row.to(kind) for row, kind in zip(sums, ctx.kinds, strict=True))
@@ -365,6 +371,7 @@ class _Gates(torch.autograd.Function):
         x: torch.Tensor,
         state: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (y, state), both [B, C, H, W]; the state is of the type ``kind``."""
         from brainbench.models.ops.kernels import intersection as kernels
 
         rows = _rows(fused)
@@ -375,6 +382,7 @@ class _Gates(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, d_y: torch.Tensor, d_after: torch.Tensor) -> Any:
+        """Return the gradients of pre-activations, x and state; those of the norms are added to their sums."""
         from brainbench.models.ops.kernels import intersection as kernels
 
         rows, x, state, *norms = ctx.saved_tensors

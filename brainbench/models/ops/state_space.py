@@ -40,12 +40,14 @@ class _LinearScan(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Return h [B, T, ...] with h_t = a_t h_{t−1} + b_t, from zero."""
         h = _solve(a, b)
         ctx.save_for_backward(a, h)
         return h
 
     @staticmethod
     def backward(ctx: Any, grad: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Return the gradients of a and b, both [B, T, ...]."""
         a, h = ctx.saved_tensors
         # The adjoint g_t = grad_t + a_{t+1} g_{t+1} is the recurrence on the reversed axis.
         following = torch.cat((a[:, 1:], torch.zeros_like(a[:, :1])), 1)

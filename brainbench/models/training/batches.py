@@ -181,12 +181,12 @@ def _image(x: torch.Tensor, draw: SampledAugmentation, _how: Augmentation) -> to
     scale = _constant(units, x.device).to(x.dtype).view(-1, 1, 1)
     y = x / scale
 
-    def drawn(*shape: int) -> torch.Tensor:
+    def _drawn(*shape: int) -> torch.Tensor:
         return draw.uniform(len(x), *shape).to(device=x.device, dtype=x.dtype)
 
     # Colour jitter: every channel its own brightness (offset) and contrast (gain).
     spread = y.flatten(1).std(1).view(-1, 1, 1, 1, 1)
-    offset, gain = drawn(1, x.shape[2], 1, 1), drawn(1, x.shape[2], 1, 1)
+    offset, gain = _drawn(1, x.shape[2], 1, 1), _drawn(1, x.shape[2], 1, 1)
     y = torch.where(draw.coins(x, 0.8), y * (0.6 + 0.8 * gain) + 0.4 * spread * (2 * offset - 1), y)
     y = torch.where(draw.coins(x, 0.2), y.mean(2, keepdim=True).expand_as(y), y)
     kernel = _constant((1.0, 2.0, 1.0), x.device).to(x.dtype)
@@ -239,7 +239,6 @@ class Batches(Protocol):
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on where ``state`` was taken."""
-        ...
 
 
 @runtime_checkable
@@ -254,7 +253,6 @@ class Data(Protocol):
 
     def batches(self, split: str, options: BatchOptions) -> Batches | None:
         """Return the batches of ``train``, ``validation`` or ``test``; None if there is no such split."""
-        ...
 
 
 @dataclass

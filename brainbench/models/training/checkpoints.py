@@ -125,7 +125,7 @@ def find_folder(source: str) -> Path:
     with needing("huggingface_hub", extra="hub", purpose="Loading a model from a hub"):
         from huggingface_hub import snapshot_download
 
-    def download(*names: str) -> Path:
+    def _download(*names: str) -> Path:
         patterns = ["/".join((*inner, item)) for item in names]
         try:
             root = snapshot_download(f"{owner}/{name}", revision=revision or None, allow_patterns=patterns)
@@ -134,9 +134,9 @@ def find_folder(source: str) -> Path:
             raise DataFileNotFoundError(f"{source!r} could not be had from the hub: {reason}") from error
         return Path(root).joinpath(*inner)
 
-    folder = download(WEIGHTS, CONFIG, CARD)
+    folder = _download(WEIGHTS, CONFIG, CARD)
     # Foreign checkpoints are large, so they are asked for only where there is none of ours.
-    return folder if (folder / CONFIG).is_file() else _imported(download(FOREIGN, SETTINGS), source)
+    return folder if (folder / CONFIG).is_file() else _imported(_download(FOREIGN, SETTINGS), source)
 
 
 def _imported(folder: Path, source: str) -> Path:

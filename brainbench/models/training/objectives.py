@@ -392,11 +392,11 @@ class Gradients:
         buffers = {name: value.clone() for name, value in self.module.named_buffers()}
         random = torch.cuda.get_rng_state(device) if device.type == "cuda" else torch.get_rng_state()
 
-        def work() -> None:
+        def _work() -> None:
             self._found = self._compute(self._inputs)
             self._kept = [parameter.grad for parameter in self.parameters]
 
-        self._replay = record_step(work, device)
+        self._replay = record_step(_work, device)
         if device.type == "cuda":
             torch.cuda.set_rng_state(random, device)
         else:

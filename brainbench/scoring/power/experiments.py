@@ -259,7 +259,7 @@ def simulate_experiments(generator: np.random.Generator, design: ExperimentDesig
     rdms = partial(_rdms, generator, design.stimuli, design.dimensions)
     c, q = design.consistency, design.reliability_of_differences
 
-    def mixed(comparison: float, rdm: Floats, rest: Floats) -> Floats:
+    def _mixed(comparison: float, rdm: Floats, rest: Floats) -> Floats:
         # The weights x and √(1 − x²) keep every RDM at unit variance.
         weight = _weight(min(abs(comparison), 1.0), design.stimuli, design.dimensions)
         return math.copysign(weight, comparison) * rdm + math.sqrt(1 - weight**2) * rest
@@ -267,9 +267,9 @@ def simulate_experiments(generator: np.random.Generator, design: ExperimentDesig
     # The three equations of the module's text.
     shared = rdms(size, 1)
     model = rdms(size, design.layers)
-    model[:, :1] = mixed(design.effect / math.sqrt(c) if c else 0.0, shared, model[:, :1])
-    animals = mixed(math.sqrt(c), shared, rdms(size, design.animals))
-    return model, mixed(math.sqrt(q), animals, rdms(size, design.animals))
+    model[:, :1] = _mixed(design.effect / math.sqrt(c) if c else 0.0, shared, model[:, :1])
+    animals = _mixed(math.sqrt(c), shared, rdms(size, design.animals))
+    return model, _mixed(math.sqrt(q), animals, rdms(size, design.animals))
 
 
 def _rdms(generator: np.random.Generator, stimuli: int, dimensions: int, *shape: int) -> Floats:

@@ -53,7 +53,7 @@ def with_errors(run: Run, jobs: Sequence[Job], fidelity: Fidelity, once: Run) ->
     settings, seconds = [fidelity] * len(traces), [trace.seconds for trace in traces]
     runs: dict[tuple[int, Fidelity], Trace] = {}
 
-    def simulate(chosen: Mapping[int, Fidelity]) -> None:
+    def _simulate(chosen: Mapping[int, Fidelity]) -> None:
         for setting in dict.fromkeys(chosen.values()):
             missing = [index for index in chosen if chosen[index] == setting and (index, setting) not in runs]
             for index, trace in zip(missing, once([jobs[i] for i in missing], setting) if missing else (), strict=True):
@@ -71,14 +71,14 @@ def with_errors(run: Run, jobs: Sequence[Job], fidelity: Fidelity, once: Run) ->
                 pending[index] = divided_step(fidelity, trace.divisor, job.whisker, job.spacing)
                 runs[index, pending[index]] = trace
     for place in range(ROUNDS if fidelity.error is not None else 1):
-        simulate(pending)
+        _simulate(pending)
         pending = {index: chosen for index, chosen in pending.items() if runs[index, chosen].status == "ok"}
         changed = [
             {i: halved_step(chosen, jobs[i].whisker, jobs[i].spacing) for i, chosen in pending.items()},
             {i: more_links(chosen, jobs[i].whisker) for i, chosen in pending.items()},
         ]
         for some in changed:
-            simulate(some)
+            _simulate(some)
         finer: dict[int, Fidelity] = {}
         for index, chosen in pending.items():
             job, trace = jobs[index], runs[index, chosen]

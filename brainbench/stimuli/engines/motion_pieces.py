@@ -93,7 +93,7 @@ def carried_pose(motion: RigidMotion | None, anchor: NDArray[np.float64]) -> Pos
     """Return the pose, with rotation matrices [n, 3, 3], of the point ``anchor`` [3] (m) of a body that moves."""
     assert motion is not None
 
-    def pose(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _pose(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         place, quaternions = _poses(motion(times), times, 4, "an object")
         # Most bodies never turn.
         quaternions = quaternions[: 1 if (quaternions == quaternions[:1]).all() else None]
@@ -107,7 +107,7 @@ def carried_pose(motion: RigidMotion | None, anchor: NDArray[np.float64]) -> Pos
         turn = to_matrices(quaternions)
         return place + turn @ anchor, np.broadcast_to(turn, (len(times), 3, 3))
 
-    return pose
+    return _pose
 
 
 @dataclass(frozen=True)
@@ -123,24 +123,24 @@ class Cutting:
     def follicle(self, follicle: Follicle, size: float) -> MotionPieces:
         """Cut the motion of a base whose whisker has the arc length ``size`` (m); errors as :meth:`cut`."""
 
-        def path(times: NDArray[np.float64]) -> NDArray[np.float64]:
+        def _path(times: NDArray[np.float64]) -> NDArray[np.float64]:
             position, euler = _poses(follicle.pose(times), times, 3, "the base of a whisker")
             return np.concatenate([position, euler * size], axis=1) * MILLI
 
-        return self.cut(path, getattr(follicle, "finest", None), "the base of a whisker")
+        return self.cut(_path, getattr(follicle, "finest", None), "the base of a whisker")
 
     def obstacle(self, obstacle: Obstacle, anchor: NDArray[np.float64]) -> MotionPieces:
         """Cut the motion of an obstacle, by its point ``anchor`` [3] (m) and its turns; errors as :meth:`cut`."""
         pose = carried_pose(obstacle.motion, anchor)
         size = float(np.linalg.norm(obstacle.bounds - anchor, axis=1).max())
 
-        def path(times: NDArray[np.float64]) -> NDArray[np.float64]:
+        def _path(times: NDArray[np.float64]) -> NDArray[np.float64]:
             place, turn = pose(times)
             # All share the memory of one where it does not turn.
             turns = turn.reshape(-1, 9) * size if turn.strides[0] else np.empty((len(times), 0))
             return np.concatenate([place, turns], axis=1) * MILLI
 
-        return self.cut(path, getattr(obstacle.motion, "finest", None), "an object")
+        return self.cut(_path, getattr(obstacle.motion, "finest", None), "an object")
 
     def cut(self, path: Path, finest: float | None, what: str) -> MotionPieces:
         """Cut a motion, which is not evaluated before 0 when it starts at 0 or later; ``what`` names it in messages.

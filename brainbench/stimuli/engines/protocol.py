@@ -266,7 +266,7 @@ class WhiskerEngine:
             record_shape: fill :attr:`Trace.link_positions`.
         """
 
-        def run(group: Sequence[int]) -> dict[int, Trace]:
+        def _run(group: Sequence[int]) -> dict[int, Trace]:
             some, engine = [jobs[index] for index in group], replace(self, motions={})
             simulate, once = (
                 partial(each.simulate_group, record_shape=record_shape) for each in (engine, replace(engine, retry=1))
@@ -277,7 +277,7 @@ class WhiskerEngine:
         with self.session():
             self.check(jobs, fidelity, workers)
             threads = self.threads(workers)
-            return run_groups(self.groups(jobs, fidelity, threads), run, threads=threads, progress=progress)
+            return run_groups(self.groups(jobs, fidelity, threads), _run, threads=threads, progress=progress)
 
     def prepare_sweeps(self, scenes: PassiveSweeps, fidelity: Fidelity) -> None:
         """Do, in a thread, what the first :meth:`run_sweeps` would wait for, such as compiling; no object is loaded."""

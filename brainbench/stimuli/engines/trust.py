@@ -171,16 +171,16 @@ def judge(facts: RunFacts) -> Verdict:
     retryable = (facts.status == BENT) | (facts.status == LOST) | (facts.status == GOT_INSIDE)
     reasons = np.full(facts.status.shape, "", dtype=object)
 
-    def blame(which: NDArray[np.bool_], words: Callable[[tuple[int, ...]], str]) -> None:
+    def _blame(which: NDArray[np.bool_], words: Callable[[tuple[int, ...]], str]) -> None:
         for index in zip(*np.nonzero(which), strict=True):
             reasons[index] = words(index)
 
     for status in _FAULTS.keys() & set(facts.status.ravel().tolist()):
-        blame(facts.status == status, lambda i, status=status: fault(status, facts.failed[i], facts.depth[i]))
+        _blame(facts.status == status, lambda i, status=status: fault(status, facts.failed[i], facts.depth[i]))
     # Faults with a time: the earliest counts, and what comes before it may be used.
     strong = facts.strong_at < until
     until = np.where(strong, facts.strong_at, until)
-    blame(strong, lambda i: f"at {facts.strong_at[i]:.6g} s {too_strong(facts.strength[i], facts.strongest[i])}")
+    _blame(strong, lambda i: f"at {facts.strong_at[i]:.6g} s {too_strong(facts.strength[i], facts.strongest[i])}")
     fast = facts.fast_at < until
     until = np.where(fast, facts.fast_at, until)
     # Both rest on sums over all steps and have no time, so nothing of the whisker may be used. NaN fails the comparison
@@ -188,9 +188,9 @@ def judge(facts: RunFacts) -> Verdict:
     unsolved = (until == np.inf) & ~(facts.residual <= LARGEST_RESIDUAL)
     crowded = (until == np.inf) & ~unsolved & (facts.crowded > LARGEST_CROWDED_SHARE * facts.steps)
     way, most = facts.travel * MILLI, facts.farthest * MILLI
-    blame(fast, lambda i: _TOO_FAST.format(way[i], facts.fast_at[i], most[i], np.ceil(way[i] / most[i])))
-    blame(unsolved, lambda i: _UNSOLVED.format(min(facts.residual[i], 10.0)))
-    blame(crowded, lambda i: _CROWDED.format(facts.crowded[i], facts.steps[i]))
+    _blame(fast, lambda i: _TOO_FAST.format(way[i], facts.fast_at[i], most[i], np.ceil(way[i] / most[i])))
+    _blame(unsolved, lambda i: _UNSOLVED.format(min(facts.residual[i], 10.0)))
+    _blame(crowded, lambda i: _CROWDED.format(facts.crowded[i], facts.steps[i]))
     bad = unsolved | crowded
     until = np.where(bad, -np.inf, until)
     doubtful = (

@@ -213,11 +213,11 @@ class RayTree:
         wp = warp()
         rays = [wp.vec3(*(value / self._unit).tolist()) for value in self._pixel_rays(lens)]
 
-        def cast(mesh: Any, first: int, last: int) -> None:
+        def _cast(mesh: Any, first: int, last: int) -> None:
             outputs = [face[first:last], weights[first:last]]
             wp.launch(first_hit, last - first, [mesh.id, lens.size[0], first, *rays], outputs, device="cpu")
 
-        self._in_blocks(count, cast)
+        self._in_blocks(count, _cast)
         return face, weights
 
     def blocked(self, points: NDArray[np.float64], direction: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -227,13 +227,13 @@ class RayTree:
         wp = warp()
         start, dark = self.local(points), np.zeros(len(points), dtype=np.uint8)
 
-        def cast(mesh: Any, first: int, last: int) -> None:
+        def _cast(mesh: Any, first: int, last: int) -> None:
             wp.launch(
                 blocked, last - first, [mesh.id, start[first:last], wp.vec3(*direction.tolist())], [dark[first:last]],
                 device="cpu",
             )  # fmt: skip
 
-        self._in_blocks(len(points), cast)
+        self._in_blocks(len(points), _cast)
         return dark.astype(bool)
 
     def _in_blocks(self, count: int, cast: Any) -> None:

@@ -367,10 +367,10 @@ class ContactSolver:
         low = np.array([-np.inf, -np.inf, -np.inf, NEAREST, -3.0])
         high = np.array([np.inf, np.inf, np.inf, FARTHEST, 3.0])
 
-        def residual(unknowns: Array) -> Array:
+        def _residual(unknowns: Array) -> Array:
             return self.residuals(unknowns[None], frame, place, noise)[0]
 
-        def jacobian(unknowns: Array) -> Array:
+        def _jacobian(unknowns: Array) -> Array:
             moves = np.concatenate([np.eye(5), -np.eye(5)]) * _STEP
             values = self.residuals(unknowns + moves, frame, place, noise)
             return (values[:5] - values[5:]).T / (2 * _STEP)
@@ -380,14 +380,14 @@ class ContactSolver:
         for start in self._starts(frame, place, noise, before):
             began = np.clip(start, low + 1e-3, high - 1e-3)
             limits = (low, high)
-            minimum = least_squares(residual, began, jac=jacobian, bounds=limits, max_nfev=60)  # type: ignore[arg-type]
+            minimum = least_squares(_residual, began, jac=_jacobian, bounds=limits, max_nfev=60)  # type: ignore[arg-type]
             if best is None or minimum.cost < best.cost:
                 best = minimum
         assert best is not None
-        across = residual(best.x)[: len(points)] * noise
+        across = _residual(best.x)[: len(points)] * noise
         # Four unknowns follow distances across the shape; a shift along it changes none.
         spread = math.sqrt(float(np.sum(across**2)) / max(len(points) - 4, 1))
-        matrix = jacobian(best.x) * (1.0 if self.options.noise else noise / spread)
+        matrix = _jacobian(best.x) * (1.0 if self.options.noise else noise / spread)
         covariance: Any = np.linalg.pinv(matrix.T @ matrix, rcond=1e-14)
         alike = math.sqrt(len(across)) * float(across[1:] @ across[:-1]) / max(float(across @ across), 1e-300)
         reason = "" if best.status > 0 else "The fit of the shape did not converge."

@@ -43,10 +43,10 @@ class DesignVariable:
 
 
 def _whisking(name: str, unit: str, low: float, high: float) -> DesignVariable:
-    def change(scene: Scene, value: float) -> Scene:
+    def _change(scene: Scene, value: float) -> Scene:
         return replace(scene, whisking=replace(_sinusoid(scene), **{name: value}))
 
-    return DesignVariable(unit, low, high, lambda scene: getattr(_sinusoid(scene), name), change)
+    return DesignVariable(unit, low, high, lambda scene: getattr(_sinusoid(scene), name), _change)
 
 
 def _sinusoid(scene: Scene) -> Whisking:
@@ -58,13 +58,13 @@ def _sinusoid(scene: Scene) -> Whisking:
 
 
 def _shift(axis: int) -> DesignVariable:
-    def change(scene: Scene, value: float) -> Scene:
-        def moved(position: Sequence[float]) -> Any:
+    def _change(scene: Scene, value: float) -> Scene:
+        def _moved(position: Sequence[float]) -> Any:
             return tuple(one + value * (index == axis) for index, one in enumerate(position))
 
-        return replace(scene, objects=tuple(replace(item, position=moved(item.position)) for item in scene.objects))
+        return replace(scene, objects=tuple(replace(item, position=_moved(item.position)) for item in scene.objects))
 
-    return DesignVariable("m", -0.003, 0.003, lambda scene: 0.0, change)
+    return DesignVariable("m", -0.003, 0.003, lambda scene: 0.0, _change)
 
 
 VARIABLES: Mapping[str, DesignVariable] = {
@@ -207,7 +207,7 @@ def find_motions(
 
     width = limits[:, 1] - limits[:, 0]
 
-    def cost(x: Array) -> tuple[float, Array]:
+    def _cost(x: Array) -> tuple[float, Array]:
         value, by = slope(limits[:, 0] + x * width, SCALE * width)  # type: ignore[misc]
         if math.isnan(value):  # unstable: the line search turns back
             return -NOTHING, np.zeros(len(x))
@@ -225,7 +225,7 @@ def find_motions(
     if slope is not None:
         how = {"maxiter": options.iterations, "maxls": 8}
         bounds = [(0, 1)] * len(at)
-        ends = [minimize(cost, x, jac=True, bounds=bounds, method="L-BFGS-B", options=how).x for x in best]
+        ends = [minimize(_cost, x, jac=True, bounds=bounds, method="L-BFGS-B", options=how).x for x in best]
         best = [*ends, best[0]]
     return [begin, *(limits[:, 0] + x * width for x in best)]
 

@@ -70,7 +70,7 @@ class PackedPlaces:
         motions, shapes = packed.motions.arrays(), packed.shapes.arrays()
         loads = np.cumsum([0, *(len(task.job.loads) for task in packed.tasks)])
 
-        def knots(track: int) -> slice:
+        def _knots(track: int) -> slice:
             first, count = int(motions["first"][track]), int(motions["count"][track])
             if count == 1:
                 return slice(first, first + 1)
@@ -82,8 +82,8 @@ class PackedPlaces:
             some = slice(*(int(place) for place in shapes["first"][j : j + 2]))
             tracks = iter(dict.fromkeys(shapes["track"][some].tolist()))
             by_track = {id(body.track): next(tracks) for body in {id(b.track): b for b in task.bodies}.values()}
-            bodies = tuple(knots(by_track[id(body.track)]) for body in task.bodies if body.obstacle.motion is not None)
-            base = knots(int(packed.jobs.base[j]))
+            bodies = tuple(_knots(by_track[id(body.track)]) for body in task.bodies if body.obstacle.motion is not None)
+            base = _knots(int(packed.jobs.base[j]))
             places.append(cls(task.chain.links, base, some, bodies, slice(int(loads[j]), int(loads[j + 1]))))
         return places
 
@@ -96,7 +96,7 @@ def packed_change(task: JobTask, low: Job, high: Job, width: float, quasistatic:
     changes: Numbers = {}
     span = (task.job.start, float(task.job.times[-1]))
 
-    def add(of: Callable[[Job], Numbers]) -> None:
+    def _add(of: Callable[[Job], Numbers]) -> None:
         ends = of(low), of(high)
         for name in ends[0]:
             low_value, high_value = (end[name] for end in ends)
@@ -105,18 +105,18 @@ def packed_change(task: JobTask, low: Job, high: Job, width: float, quasistatic:
             changes[name] = change / width
 
     if low.whisker is not high.whisker:
-        add(lambda job: _whisker(task, job, quasistatic))
+        _add(lambda job: _whisker(task, job, quasistatic))
     if low.follicle is not high.follicle:
-        add(lambda job: _base(task, job, span))
+        _add(lambda job: _base(task, job, span))
     if low.loads is not high.loads or low.whisker is not high.whisker:
-        add(lambda job: _loads(task, job))
+        _add(lambda job: _loads(task, job))
     if low.gravity != high.gravity:
         weight = MILLI * (LIGHT if quasistatic else 1.0)
-        add(lambda job: {"gravity": np.asarray(job.gravity, dtype=float) / weight})
+        _add(lambda job: {"gravity": np.asarray(job.gravity, dtype=float) / weight})
     _require("obstacles", len(low.obstacles), len(task.job.obstacles))
     _require("obstacles", len(high.obstacles), len(task.job.obstacles))
     if any(before is not after for before, after in zip(low.obstacles, high.obstacles, strict=True)):
-        add(lambda job: _shapes(task, job))
+        _add(lambda job: _shapes(task, job))
     return changes
 
 
@@ -445,6 +445,7 @@ class GradientRun:
         parts = [part for some in alike.values() for start in range(threads) if (part := some[start::threads])]
 
         def simulate(indices: Sequence[int]) -> tuple[_Group, list[Trace]]:
+            """Return the launch of some tasks, recorded for its gradients, and their traces."""
             some = [tasks[index] for index in indices]
             packed = PackedTasks.of(some, shared=False)
             needs = packed.shapes.needs
@@ -506,7 +507,7 @@ class GradientRun:
         events: dict[int, ContactEvents] = {}
         changes = self.changes
 
-        def forward(group: _Group) -> dict[str, NDArray[Any]]:
+        def _forward(group: _Group) -> dict[str, NDArray[Any]]:
             shapes = group.solver.packed_shapes
             arrays = {name: np.zeros((len(self.values), *shape)) for name, shape in shapes.items()}
             for row, index in enumerate(group.indices):
@@ -516,7 +517,7 @@ class GradientRun:
                         packed_part(mine, name, group.places[row], row)[...] = change[name]
             return group.solver.forward(arrays)
 
-        for group, results in zip(self._groups, _at_once(forward, self._groups), strict=True):
+        for group, results in zip(self._groups, _at_once(_forward, self._groups), strict=True):
             for row, index in enumerate(group.indices):
                 trace = self.traces[index]
                 events[index] = contact_events(results["contacts"][row], trace.reason)

@@ -54,12 +54,12 @@ def _interval(free: FreeParameters, index: int, low: float, high: float, level: 
     name = free.names[index]
     parameter, start = PARAMETERS[name], free.start[name]
 
-    def value(end: float) -> float:
+    def _value(end: float) -> float:
         if abs(end) <= 700:
             return parameter.value(start, end, free.start.whisker)
         return (0.0 if end < 0 else math.inf) if parameter.kind == "log" else end
 
-    first, second = value(low), value(high)
+    first, second = _value(low), _value(high)
     return Interval(min(first, second), max(first, second), level, method)
 
 
@@ -126,16 +126,16 @@ class Profile:
         u = np.clip(u, self.limits[0] + 1e-9, self.limits[1] - 1e-9)
         u[index] = place
 
-        def full(rest: Array) -> Array:
+        def _full(rest: Array) -> Array:
             point = u.copy()
             point[others] = rest
             return point
 
         if others:
             minimum = least_squares(
-                lambda rest: self.residual(full(rest)),
+                lambda rest: self.residual(_full(rest)),
                 u[others],
-                jac=lambda rest: self.jacobian(full(rest))[:, others],  # type: ignore[arg-type]
+                jac=lambda rest: self.jacobian(_full(rest))[:, others],  # type: ignore[arg-type]
                 bounds=(self.limits[0][others], self.limits[1][others]),
                 max_nfev=8,
                 ftol=1e-6,

@@ -364,12 +364,12 @@ def _find_series(file: Any) -> tuple[Any, Any] | None:
         return file["wrench"], file
     series: list[Any] = []
 
-    def look(name: str, node: Any) -> None:
+    def _look(name: str, node: Any) -> None:
         six = getattr(node, "ndim", 0) == 2 and (node.shape[1] == len(CHANNELS) or "channels" in node.attrs)
         if name.rpartition("/")[2] == "data" and six:
             series.append(node)
 
-    file.visititems(look)
+    file.visititems(_look)
     # Six columns may be anything; those that name their channels are wrenches.
     series = [item for item in series if "channels" in item.attrs] or series
     if len(series) > 1:

@@ -126,17 +126,17 @@ def _rodgers_recorded(file: str, trajectory: Trajectory | None, species: str, wh
     array = WhiskerArray.of(species).select(whiskers)
     whisking = Recorded(trajectory, start=_RECORDED_START)
 
-    def enlarged(scene: Scene) -> Scene:
-        def far(place: tuple[float, ...]) -> Any:
+    def _enlarged(scene: Scene) -> Scene:
+        def _far(place: tuple[float, ...]) -> Any:
             return tuple(scale * value for value in place)
 
-        head = Head(far(scene.head.position), scene.head.rotation)
+        head = Head(_far(scene.head.position), scene.head.rotation)
         objects = tuple(
-            PlacedObject(placed.solid.scaled(scale), far(placed.position), placed.rotation) for placed in scene.objects
+            PlacedObject(placed.solid.scaled(scale), _far(placed.position), placed.rotation) for placed in scene.objects
         )
         return dataclasses.replace(scene, array=array, objects=objects, whisking=whisking, head=head)
 
-    scenes = tuple(enlarged(scene) for scene in get_recipe("rodgers").scenes)
+    scenes = tuple(_enlarged(scene) for scene in get_recipe("rodgers").scenes)
     return Recipe(RECORDED, describe_recipe(RECORDED), scenes)
 
 

@@ -162,7 +162,7 @@ def run_pipelined(tasks: Sequence[ShardTask], folder: Path, workers: int, done: 
     at_once = _shards_at_once(tasks[0])
     free = threading.Semaphore(at_once)
 
-    def make(task: ShardTask, objects: Sequence[BuiltObject]) -> int:
+    def _make(task: ShardTask, objects: Sequence[BuiltObject]) -> int:
         with free:
             content = simulate_shard(task, objects, workers)
         return write_shard(content, folder)
@@ -176,7 +176,7 @@ def run_pipelined(tasks: Sequence[ShardTask], folder: Path, workers: int, done: 
                 # Fails where the first shard will fail, which tells of it.
                 threads.submit(warm_up, tasks[0])
                 for task, objects in _built_ahead(tasks, builders, processes):
-                    making.add(threads.submit(make, task, objects))
+                    making.add(threads.submit(_make, task, objects))
                     del objects
                     if len(making) == most:
                         ended, making = wait(making, return_when=FIRST_COMPLETED)
@@ -364,13 +364,13 @@ def generate(
         )
     get_engine(plan.settings.backend, device=plan.settings.device)
 
-    def run(missing: Sequence[Any], folder: Path, done: Callable[[int], None]) -> None:
+    def _run(missing: Sequence[Any], folder: Path, done: Callable[[int], None]) -> None:
         if scheduler is not None:
             run_shards_on_cluster(missing, folder, scheduler, done)
         elif missing:
             run_here(missing, folder, workers, done)
 
-    return write_data_set(plan.shards, plan.objects, out, run, what="simulating sweeps", progress=progress)
+    return write_data_set(plan.shards, plan.objects, out, _run, what="simulating sweeps", progress=progress)
 
 
 def write_data_set(
@@ -416,7 +416,7 @@ def _reporter(total: int, what: str, progress: Progress | None) -> Callable[[int
     done, started = 0, time.monotonic()
     logged = started
 
-    def report(sweeps: int) -> None:
+    def _report(sweeps: int) -> None:
         nonlocal done, logged
         done += sweeps
         if progress is not None:
@@ -428,7 +428,7 @@ def _reporter(total: int, what: str, progress: Progress | None) -> Callable[[int
             rest = timedelta(seconds=round((total - done) / rate))
             _LOG.info("%d of %d sweeps, %.3g sweeps/s, about %s left", done, total, rate, rest)
 
-    return report
+    return _report
 
 
 def _clean(folder: Path) -> None:

@@ -151,11 +151,11 @@ def slip_off(
     # Near the end it creeps, because the last fold takes the longer the nearer it is to equilibrium.
     duration, approach = 70 * settling, 10 * settling
 
-    def depth(times: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _depth(times: NDArray[np.float64]) -> NDArray[np.float64]:
         return expected * np.interp(times, [0.0, approach, duration], [0.0, 0.94, 1.12])
 
     times = np.linspace(0, duration, 2001)[1:]
-    rod = _pulley(whisker, peg_radius, sliding(lambda t: np.column_stack([np.full(len(t), at), touch + depth(t)])))
+    rod = _pulley(whisker, peg_radius, sliding(lambda t: np.column_stack([np.full(len(t), at), touch + _depth(t)])))
     trace = run_one(backend, job_at_rest(whisker, times, rod), fidelity)
     held = np.flatnonzero(trace.contact)
     if not len(held) or held[-1] == len(times) - 1:
@@ -163,7 +163,7 @@ def slip_off(
             f"The whisker did not slip off the peg at {at:g} m within 1.12 times the depth of the elastica "
             f"({expected:.4g} m)."
         )
-    return SlipOff(float(depth(times[held[-1] + 1])), float(expected), trace)
+    return SlipOff(float(_depth(times[held[-1] + 1])), float(expected), trace)
 
 
 def _relative(measured: NDArray, reference: NDArray) -> float:
@@ -178,11 +178,11 @@ def job_at_rest(whisker: Whisker, times: NDArray[np.float64], *obstacles: Obstac
 def sliding(place: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> RigidMotion:
     """Return the motion of a body that does not turn, through points [n, 3] (m), or [n, 2] in the plane of bending."""
 
-    def motion(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _motion(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         points = place(times)
         return np.pad(points, ((0, 0), (0, 3 - points.shape[1]))), np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1))
 
-    return motion
+    return _motion
 
 
 def _peg_obstacle(whisker: Whisker, radius: float, motion: RigidMotion) -> Obstacle:
@@ -333,7 +333,7 @@ def fit_decay(times: NDArray, signal: NDArray, frequency: float, ratio: float) -
 
     scale = float(np.abs(signal).max())
 
-    def model(t: NDArray, omega: float, zeta: float, a: float, b: float) -> NDArray:
+    def _model(t: NDArray, omega: float, zeta: float, a: float, b: float) -> NDArray:
         # ω is undamped; a damped mode rings at ω √(1 − ζ²).
         ringing = omega * math.sqrt(max(1 - zeta**2, 1e-12)) * t
         return np.exp(-zeta * omega * t) * (a * np.cos(ringing) + b * np.sin(ringing))
@@ -341,7 +341,7 @@ def fit_decay(times: NDArray, signal: NDArray, frequency: float, ratio: float) -
     start = (2 * math.pi * frequency, ratio, 1.0, 0.0)
     try:
         fitted, _ = curve_fit(
-            model, times, signal / scale, p0=start, bounds=((0, 0, -1e6, -1e6), (np.inf, 1, 1e6, 1e6))
+            _model, times, signal / scale, p0=start, bounds=((0, 0, -1e6, -1e6), (np.inf, 1, 1e6, 1e6))
         )
     except (RuntimeError, ValueError) as error:
         raise DataError(

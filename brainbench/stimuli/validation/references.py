@@ -173,10 +173,10 @@ class _Branch:
                     raise UsageError(f"A peg at ({self.at:g}, {offset:g}) m does not touch the undeformed whisker.")
                 low = before
 
-                def miss(angle: float, low: tuple = low) -> float:
+                def _miss(angle: float, low: tuple = low) -> float:
                     return self._height(angle, self._solve(angle, low[1])) - target
 
-                root = cast("float", brentq(miss, low[0], slope, xtol=1e-13))
+                root = cast("float", brentq(_miss, low[0], slope, xtol=1e-13))
                 return self._contact(root, self._solve(root, guess))
             before = (slope, guess)
         raise UsageError(
@@ -193,12 +193,12 @@ class _Branch:
         top = max(range(len(points)), key=lambda k: points[k][2])
         low = points[max(top - 1, 0)]
 
-        def fall(angle: float) -> float:
+        def _fall(angle: float) -> float:
             solution = self._solve(angle, low[1])
             return -self._height(angle, solution) if self._valid(solution) else 0.0
 
         span = low[0], points[top][0] + self._STRIDE
-        optimum = minimize_scalar(fall, bounds=span, method="bounded", options={"xatol": 1e-9})
+        optimum = minimize_scalar(_fall, bounds=span, method="bounded", options={"xatol": 1e-9})
         return self.side * max(points[top][2], -float(optimum.fun))
 
     def _walk(self):  # noqa: ANN202

@@ -247,24 +247,24 @@ def _path(bends: tuple[tuple[float, float, float], ...]) -> Any:
 
     arcs, curvatures, torsions = np.transpose(bends)
 
-    def slope(s: float, state: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _slope(s: float, state: NDArray[np.float64]) -> NDArray[np.float64]:
         tangent, normal, binormal = state[3:].reshape(3, 3)
         bend, turn = np.interp(s, arcs, curvatures), np.interp(s, arcs, torsions)
         return np.concatenate([tangent, bend * normal, turn * binormal - bend * tangent, -turn * normal])
 
     state, pieces = np.concatenate([np.zeros(3), np.eye(3).ravel()]), []
     for ends in pairwise(arcs):  # each by itself, so that rows may lie as near as they like
-        solution = solve_ivp(slope, ends, state, "DOP853", rtol=1e-12, atol=1e-15, dense_output=True)
+        solution = solve_ivp(_slope, ends, state, "DOP853", rtol=1e-12, atol=1e-15, dense_output=True)
         state = solution.y[:, -1]
         pieces.append(solution.sol)
 
-    def path(s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _along(s: NDArray[np.float64]) -> NDArray[np.float64]:
         rows = np.searchsorted(arcs[1:-1], s, side="right")
         return np.stack([pieces[row](arc) for row, arc in zip(rows.flat, s.flat, strict=True)], -1).reshape(
             12, *s.shape
         )
 
-    return path
+    return _along
 
 
 def quadrature(low: float, high: float, breaks: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -463,11 +463,11 @@ def _frusta(whisker: Whisker, nodes: NDArray, lengths: NDArray) -> tuple[NDArray
     s = edges[:-1, None] + half[:, None] * (NODES + 1)
     density, along = whisker.linear_density(s), s - nodes[link][:, None]
 
-    def integrate(values: NDArray) -> NDArray:
+    def _integrate(values: NDArray) -> NDArray:
         return np.bincount(link, half * (values @ WEIGHTS))
 
-    masses, first, second = (integrate(density * along**power) for power in range(3))
-    polar = integrate(density * whisker.radius(s) ** 2 / 4)
+    masses, first, second = (_integrate(density * along**power) for power in range(3))
+    polar = _integrate(density * whisker.radius(s) ** 2 / 4)
     # Arc to chord: the mass of an arc is spread along a slightly shorter line.
     ratio = lengths / np.diff(nodes)
     centres = first / masses * ratio

@@ -390,9 +390,11 @@ class _Learned(TactileEncoder):
         self.scale = RunningScale(self.shape[2])
 
     def observe_scale(self, taxels: torch.Tensor) -> None:
+        """Count readings [..., C], each channel by itself."""
         self.scale.update(taxels)
 
     def unroll(self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None) -> Stepped:
+        """Return (embeddings [L, B, F], h_out [B, H]); without memory from one batch of L · B readings."""
         if self.state_size:
             return super().unroll(taxels, h_in, ended)
         # Without memory all steps are one batch.
@@ -409,6 +411,7 @@ class _Flat(_Learned):
         self.net = elu_perceptron(slots * items * channels, (_HIDDEN, _HIDDEN), self.features)
 
     def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (embedding [B, F], ``h_in`` [B, 0]) of readings [B, S, N, C]."""
         return self.net(self.scale(taxels).flatten(1)), h_in
 
 
@@ -423,6 +426,7 @@ class _Recurrent(_Learned):
         self.head = nn.Linear(config.units, self.features)
 
     def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (embedding [B, F], h_out [B, 2 · units]), hidden state and memory side by side."""
         # Both states of the LSTM travel in one array, as exported policies pass all memory through one input.
         hidden, memory = h_in.chunk(2, 1)
         hidden, memory = self.cell(self.scale(taxels).flatten(1), (hidden, memory))
@@ -463,6 +467,7 @@ class _Images(_Learned):
         self.register_buffer("index", index.flatten(), persistent=False)
 
     def observe_scale(self, taxels: torch.Tensor) -> None:
+        """Count readings [..., C], or on a canvas the six components of their wrenches."""
         self.scale.update(self.grid.wrenches(taxels.flatten(0, -4)) if self.canvas else taxels)
 
     def pictures(self, taxels: torch.Tensor) -> torch.Tensor:
@@ -496,6 +501,7 @@ class _Convolution(_Images):
         self.head = self._head_of(second)
 
     def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (embedding [B, F], ``h_in`` [B, 0]) of readings [B, S, N, C]."""
         return self.answer(self.net(self.pictures(taxels)), taxels.shape[0]), h_in
 
 
@@ -511,11 +517,13 @@ class _ConvRecurrent(_Images):
         self.products: ConvGRUProducts | None = ConvGRUProducts(self.rows, self.columns, _KERNEL) if small else None
 
     def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (embedding [B, F], h_out [B, images · channels · rows · columns])."""
         state = h_in.reshape(-1, _CHANNELS[0], self.rows, self.columns)
         y, state = self.cell(self.pictures(taxels), state)
         return self.answer(y, taxels.shape[0]), state.reshape(h_in.shape)
 
     def unroll(self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None) -> Stepped:
+        """Return (embeddings [L, B, F], h_out [B, H]), on a GPU by matrix products for small images."""
         # Processors convolve faster than they multiply.
         if self.products is None or not taxels.is_cuda:
             return super().unroll(taxels, h_in, ended)
@@ -550,14 +558,17 @@ class _Network(TactileEncoder):
 
     @property
     def frozen_part(self) -> FrontEnd | None:
+        """The network with its input, None where it learns with the policy."""
         return self.front if self.config.learning == "frozen" else None
 
     def unroll(self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None) -> Stepped:
+        """Return (embeddings [L, B, F], h_out [B, H]) of readings [L, B, S, N, C] or features [L, B, F]."""
         if taxels.ndim == 3:
             return self.project(self.norm(taxels)), h_in
         return super().unroll(taxels, h_in, ended)
 
     def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (embedding [B, F], h_out [B, H]), the latter the packed state of the network."""
         features, h_out = self.front(taxels, h_in)
         return self.project(self.norm(features)), h_out
 
@@ -574,9 +585,11 @@ class _Reservoir(TactileEncoder):
         self.norm, self.project = FeatureNorm(UNITS), nn.Linear(UNITS, self.features)
 
     def observe_scale(self, taxels: torch.Tensor) -> None:
+        """Count readings [T, B, S, N, C] as wrenches of the cells, each component by itself."""
         self.scale.update(self.grid.wrenches(taxels.flatten(0, -4)))
 
     def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return (embedding [B, F], h_out [B, units]) of readings [B, S, N, C]."""
         felt = self.scale(self.grid.wrenches(taxels)).flatten(1)
         h_out = self.echo(self.echo.drive(felt), h_in)
         return self.project(self.norm(h_out)), h_out

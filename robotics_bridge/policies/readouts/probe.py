@@ -128,21 +128,21 @@ def _ridge(x: torch.Tensor, y: torch.Tensor, valid: torch.Tensor) -> Callable[[t
     mean, scale, centre = rows.mean(0), rows.std(0), aim.mean(0)
     used = scale > 1e-7 * scale.max().clamp(min=1e-30)
 
-    def standard(values: torch.Tensor) -> torch.Tensor:
+    def _standard(values: torch.Tensor) -> torch.Tensor:
         # A taxel that was hardly ever touched would otherwise throw a prediction where it is.
         return ((values[..., used] - mean[used]) / scale[used]).clamp(-FARTHEST, FARTHEST)
 
-    z = standard(rows)
+    z = _standard(rows)
     gram, products = z.T @ z / len(z), z.T @ (aim - centre) / len(z)
     solved: dict[float, torch.Tensor] = {}
 
-    def predict(values: torch.Tensor, penalty: float) -> torch.Tensor:
+    def _predict(values: torch.Tensor, penalty: float) -> torch.Tensor:
         if penalty not in solved:
             ridge = gram + penalty * torch.eye(len(gram), dtype=gram.dtype, device=gram.device)
             solved[penalty] = torch.cholesky_solve(products, torch.linalg.cholesky(ridge))
-        return standard(values) @ solved[penalty] + centre
+        return _standard(values) @ solved[penalty] + centre
 
-    return predict
+    return _predict
 
 
 HALVES = 2  # parts of the environments; what is chosen on the others is read on each

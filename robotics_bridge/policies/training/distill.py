@@ -420,16 +420,16 @@ class _Run:
         earlier: dict[str, Any] = {}
         origins = origins_of(self.config)
 
-        def stated(document: dict[str, Any]) -> object:
+        def _stated(document: dict[str, Any]) -> object:
             check_version(document, str(self.out))
             earlier.update(document)
             # Runs of earlier versions do not say what they learned from.
             return {**document.get("distill", {}), **origins, **(document.get("origins") or {})}
 
-        def begin() -> dict[str, Any]:
+        def _begin() -> dict[str, Any]:
             return {**describe_run(self.config, self.student, self.env), "origins": origins}
 
-        claim(self.out / CONFIG, asdict(self.config) | origins, begin, stated=stated, what="student")
+        claim(self.out / CONFIG, asdict(self.config) | origins, _begin, stated=_stated, what="student")
         if earlier:
             check_hand(earlier, self.env, str(self.out))
             check_probes(self.config.resolution, earlier.get("deployment", {}).get("probes"))

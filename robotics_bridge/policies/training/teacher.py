@@ -531,7 +531,7 @@ def _resume(trainer: Trainer, run: Path, facts: dict[str, Any]) -> None:
     """Claim the folder of a run, and go on from its last state where there is one."""
     document = run / "config.json"
 
-    def stated(document_of_run: dict[str, Any]) -> object:
+    def _stated(document_of_run: dict[str, Any]) -> object:
         check_version(document_of_run, str(run))
         # Settings that came later than the run had their defaults in it.
         settings = from_json(TeacherSettings, document_of_run.get("settings"), f"settings of {document}")
@@ -540,7 +540,7 @@ def _resume(trainer: Trainer, run: Path, facts: dict[str, Any]) -> None:
     # Without a state the run has yet to begin with it, and who names another expects that one.
     free = facts["start"] is None and (run / STATE).exists()
     identity = {name: facts[name] for name in (_IDENTITY if free else (*_IDENTITY, "start"))}
-    claim(document, identity, lambda: facts | {"provenance": provenance()}, stated=stated)
+    claim(document, identity, lambda: facts | {"provenance": provenance()}, stated=_stated)
     if not (run / STATE).exists():
         return
     state = load_state(run / STATE)

@@ -194,20 +194,20 @@ def fit_dynamics(parts: list[Aligned], dt: float, quantum: float, *, moving: boo
     spread = math.sqrt(float(np.mean([np.mean(y**2) for y in target.y]))) or 1e-12
     duration, no_lag = max(len(x) for x in target.x) * dt, math.log(10 * dt)
 
-    def dynamics_of(white: float, walk: float, hysteresis: float, tau: float) -> Dynamics:
+    def _dynamics_of(white: float, walk: float, hysteresis: float, tau: float) -> Dynamics:
         # White noise far below the drift changes nothing. Hysteresis of less than a reading is a delay by another name.
         hysteresis = min(max(hysteresis, -MOST_HYSTERESIS), MOST_HYSTERESIS)
         return Dynamics(max(white, walk - 14), walk, hysteresis, min(max(tau, math.log(dt)), math.log(100 * duration)))
 
-    def minimum(dynamics: Callable[[list[float]], Dynamics], start: list[float]) -> tuple[list[float], float]:
+    def _minimum(dynamics: Callable[[list[float]], Dynamics], start: list[float]) -> tuple[list[float], float]:
         options = {"xatol": 1e-6, "fatol": 1e-7, "maxiter": 4000, "maxfev": 4000}
         solution = minimize(lambda p: target(dynamics(p)), start, method="Nelder-Mead", options=options)
         return [float(value) for value in solution.x], float(solution.fun)
 
-    noise, plain_cost = minimum(
-        lambda p: dynamics_of(p[0], p[1], 0.0, no_lag), [math.log(spread / 2), math.log(spread / 20)]
+    noise, plain_cost = _minimum(
+        lambda p: _dynamics_of(p[0], p[1], 0.0, no_lag), [math.log(spread / 2), math.log(spread / 20)]
     )
-    plain = dynamics_of(noise[0], noise[1], 0.0, no_lag)
+    plain = _dynamics_of(noise[0], noise[1], 0.0, no_lag)
     best, cost = plain, plain_cost
     if moving:
         # The likelihood has several maxima in τ: starts spread over the decades that the log can tell.
@@ -215,9 +215,9 @@ def fit_dynamics(parts: list[Aligned], dt: float, quantum: float, *, moving: boo
         if start and start.dynamics.hysteresis:
             taus = [start.dynamics.tau]
         for tau in taus:
-            point, value = minimum(lambda p: dynamics_of(*p), [*noise, 0.1, math.log(tau)])
+            point, value = _minimum(lambda p: _dynamics_of(*p), [*noise, 0.1, math.log(tau)])
             if value < cost - 1e-9:
-                best, cost = dynamics_of(*point), value
+                best, cost = _dynamics_of(*point), value
     # Likelihood-ratio tests: a knob must earn its place, or every log would have a little drift and hysteresis.
     # Each unknown ξ before an episode under load is one number more.
     more = float(chi2.isf(0.01, 2 + sum(target.loaded)) - chi2.isf(0.01, 2))
@@ -226,13 +226,13 @@ def fit_dynamics(parts: list[Aligned], dt: float, quantum: float, *, moving: boo
         best, cost = plain, plain_cost
     tiny = math.log(1e-6) + best.log_white
 
-    def without_drift(p: list[float]) -> Dynamics:
-        return dynamics_of(p[0], tiny, p[1] if hysteresis else 0.0, p[2])
+    def _without_drift(p: list[float]) -> Dynamics:
+        return _dynamics_of(p[0], tiny, p[1] if hysteresis else 0.0, p[2])
 
-    point, value = minimum(without_drift, [best.log_white, best.hysteresis, best.log_tau])
+    point, value = _minimum(_without_drift, [best.log_white, best.hysteresis, best.log_tau])
     drifts = 2 * (value - cost) > SIGNIFICANT
     if not drifts:
-        best, cost = without_drift(point), value
+        best, cost = _without_drift(point), value
     free = ["log_white"] + ["log_walk"] * drifts + ["hysteresis", "log_tau"] * hysteresis
     estimates = _estimates(best, _errors(target, best, free), quantum)
     gains, gain_errors = target.gains(best) if moving else (np.ones(1), np.ones(1))
@@ -247,7 +247,7 @@ def _errors(target: _Likelihood, best: Dynamics, free: list[str]) -> dict[str, f
     step, n = 1e-3, len(free)
     hessian = np.zeros((n, n))
 
-    def cost(*moves: tuple[int, float]) -> float:
+    def _cost(*moves: tuple[int, float]) -> float:
         values = {name: getattr(best, name) for name in free}
         for index, move in moves:
             values[free[index]] += move
@@ -257,8 +257,8 @@ def _errors(target: _Likelihood, best: Dynamics, free: list[str]) -> dict[str, f
         for j in range(n):
             # Central second differences of the likelihood; the inverse of the curvature is the covariance. The
             # pseudo-inverse copes with parameters that the log does not tell.
-            corners = cost((i, step), (j, step)) - cost((i, step), (j, -step))
-            corners += cost((i, -step), (j, -step)) - cost((i, -step), (j, step))
+            corners = _cost((i, step), (j, step)) - _cost((i, step), (j, -step))
+            corners += _cost((i, -step), (j, -step)) - _cost((i, -step), (j, step))
             hessian[i, j] = corners / (4 * step * step)
     # The pseudo-inverse copes with parameters that the log does not tell.
     covariance = np.linalg.pinv((hessian + hessian.T) / 2)
@@ -269,22 +269,22 @@ def _estimates(best: Dynamics, errors: dict[str, float], quantum: float) -> dict
     """Turn parameters into knobs; the rounding's share leaves the white noise."""
     how = "likelihood of the differences"
 
-    def spread(name: str) -> tuple[float, float, float]:
+    def _spread(name: str) -> tuple[float, float, float]:
         value, error = getattr(best, name), min(Z95 * errors[name], _UNTOLD)
         return math.exp(value), math.exp(value - error), math.exp(value + error)
 
     # Rounding to steps q has the variance q²/12, which the fit has counted as white noise.
-    white = [math.sqrt(max(value**2 - quantum**2 / 12, 0.0)) for value in spread("log_white")]
+    white = [math.sqrt(max(value**2 - quantum**2 / 12, 0.0)) for value in _spread("log_white")]
     estimates = {"white": Estimate(white[0], white[1], white[2], how)}
     if Z95 * errors["log_white"] >= _UNTOLD:
         estimates["white"] = Estimate(0.0, 0.0, math.nan, "too little beside the drift to be told")
     if "log_walk" in errors:
-        estimates["walk"] = Estimate(*spread("log_walk"), how)
+        estimates["walk"] = Estimate(*_spread("log_walk"), how)
     else:
         estimates["walk"] = Estimate(0.0, 0.0, math.nan, "no drift beyond chance")
     if "hysteresis" in errors:
         half = Z95 * errors["hysteresis"]
-        estimates["hysteresis_tau"] = Estimate(*spread("log_tau"), how)
+        estimates["hysteresis_tau"] = Estimate(*_spread("log_tau"), how)
         estimates["hysteresis"] = Estimate(best.hysteresis, best.hysteresis - half, best.hysteresis + half, how)
     else:
         estimates["hysteresis"] = Estimate(0.0, math.nan, math.nan, "none beyond chance")
@@ -341,7 +341,7 @@ def find_delays(parts: list[Episode], longest: int) -> tuple[int, int]:
     steps = [np.diff(y[longest:], axis=0) for _x, y in parts]
     powers = [np.maximum((step * step).sum(axis=0), 1e-300) for step in steps]
 
-    def explained(first: int, last: int) -> float:
+    def _explained(first: int, last: int) -> float:
         score = 0.0
         for (x, _y), step, power in zip(parts, steps, powers, strict=True):
             # Squared correlation of differences: gain, bias and drift of the readings do not enter.
@@ -350,13 +350,13 @@ def find_delays(parts: list[Episode], longest: int) -> tuple[int, int]:
             score += float(((a @ step) ** 2 / energy / power).mean()) if energy > 0 else 0.0
         return score
 
-    best = max(((lag, lag) for lag in range(longest + 1)), key=lambda lags: explained(*lags))
+    best = max(((lag, lag) for lag in range(longest + 1)), key=lambda lags: _explained(*lags))
     while True:
         first, last = best
         steps_of = [(-1, 0), (1, 0), (0, -1), (0, 1)]
         near = [(first + a, last + b) for a, b in steps_of if 0 <= first + a <= last + b <= longest]
-        neighbour = max(near, key=lambda lags: explained(*lags), default=best)
-        if explained(*neighbour) <= explained(*best):
+        neighbour = max(near, key=lambda lags: _explained(*lags), default=best)
+        if _explained(*neighbour) <= _explained(*best):
             return best
         best = neighbour
 

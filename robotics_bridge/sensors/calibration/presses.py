@@ -222,11 +222,11 @@ def answer(presses: Presses, device: Device, mixing: NDArray[np.float64] | None)
     along = turned_axes(device)
     turned = np.moveaxis(np.cross(along, signal[:, :, None]), -1, 0)
 
-    def read(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _read(values: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.einsum("nci,...tni->...tnc", along, values)
 
     felt = late(np.concatenate([slope[:3], clean[None]]), axis=1)
-    return Answer(read(signal) + device.bias, read(shared), felt, turned, along)
+    return Answer(_read(signal) + device.bias, _read(shared), felt, turned, along)
 
 
 def readings_of(presses: Presses, device: Device, mixing: NDArray[np.float64] | None) -> NDArray[np.float64]:

@@ -392,6 +392,7 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, mode: int, sticky: bool,
         plan: SpreadPlan, probes: ProbeArrays, solids: SolidArrays, pairs: PairArrays, faces: ContactFaces,
         press: PressArrays, push: ContactPush, env: int, place: int, rivals: int, face: int,
     ) -> Carrier:  # fmt: skip
+        """Return the part of taxel ``place`` (of those listed, or of all) in a push; without weight if it has none."""
         carrier = Carrier()
         touches = push.source == wp.static(TOUCH)
         n = wp.where(touches, press.listed[env, place], place)

@@ -318,6 +318,7 @@ def distance_function(kinds: frozenset[int], raycast: bool) -> Any:
 
     @wp.func
     def nearest(values: wp.array(dtype=wp.float32), shape: SolidShape, x: wp.vec3f, reach: float) -> wp.vec4f:
+        """Return outward normal and signed distance of the surface nearest to ``x``, whichever its side."""
         if wp.static(PLANE in kinds):
             if shape.kind == wp.static(PLANE):
                 return plane(shape.size, x)
@@ -348,6 +349,7 @@ def distance_function(kinds: frozenset[int], raycast: bool) -> Any:
         values: wp.array(dtype=wp.float32), shape: SolidShape, x: wp.vec3f, facing: wp.vec3f, side: float,
         found: wp.vec4f,
     ) -> wp.vec4f:  # fmt: skip
+        """Return normal and distance of a thin solid on the side that the sensor came through."""
         # As for walls: past the middle of a thin solid the side touched stays the same. Steps of the distance itself
         # lead from the point back along the sensor's normal to the side that it came through.
         radius = wp.length(facing)

@@ -32,7 +32,6 @@ wp = warp()
 )
 def load_four(values: wp.array(dtype=wp.vec4f), n: int) -> wp.vec4f:
     """Return one vector."""
-    ...
 
 
 @wp.func_native(
@@ -46,7 +45,6 @@ def load_four(values: wp.array(dtype=wp.vec4f), n: int) -> wp.vec4f:
 )
 def load_planes(planes: wp.array3d(dtype=wp.float32), row: int, n: int, count: int) -> wp.spatial_vectorf:
     """Return one place of the first planes, at most six."""
-    ...
 
 
 @wp.func_native(
@@ -58,7 +56,6 @@ def load_planes(planes: wp.array3d(dtype=wp.float32), row: int, n: int, count: i
 )
 def store_planes(planes: wp.array3d(dtype=wp.float32), row: int, n: int, count: int, value: wp.spatial_vectorf):
     """Write one place of the first planes, at most six."""
-    ...
 
 
 @wp.func
@@ -94,16 +91,20 @@ def group_functions(lanes: int) -> SimpleNamespace:
 """
 
     @wp.func_native(f"{head} {{ {sums} }}{tail}")
-    def total(value: wp.vec3f) -> wp.vec3f: ...
+    def total(value: wp.vec3f) -> wp.vec3f:
+        """Return the sum over the group."""
 
     @wp.func_native(f"{head} value = max(value, __shfl_xor_sync(group, value, half));{tail}")
-    def largest(value: float) -> float: ...
+    def largest(value: float) -> float:
+        """Return the greatest of the group."""
 
     @wp.func_native(ranks)
-    def rank(chosen: bool) -> wp.vec2i: ...
+    def rank(chosen: bool) -> wp.vec2i:
+        """Return how many threads before this one and how many of the group are chosen."""
 
     @wp.func_native(f"{members} __syncwarp(group);\n#endif\n")
-    def meet(): ...
+    def meet():
+        """Wait until all threads of the group are here, so that each sees what the others wrote."""
 
     return SimpleNamespace(total=total, largest=largest, rank=rank, meet=meet)
 

@@ -301,13 +301,13 @@ def _love(layout: tuple[int, ...], pitch: tuple[float, float]) -> np.ndarray:
     y = np.arange(1 - layout[0], layout[0])[:, None] * pitch[0]
     x = np.arange(1 - layout[1], layout[1])[None, :] * pitch[1]
 
-    def corner(along: np.ndarray, across: np.ndarray) -> np.ndarray:
+    def _corner(along: np.ndarray, across: np.ndarray) -> np.ndarray:
         # Sum over corners of along · asinh(across / |along|) + across · asinh(along / |across|): never a log of zero,
         # because corners of cells do not lie on axes through the middles of others.
         return along * np.arcsinh(across / np.abs(along)) + across * np.arcsinh(along / np.abs(across))
 
     a, b = pitch[1] / 2, pitch[0] / 2
-    return corner(x + a, y + b) - corner(x - a, y + b) - corner(x + a, y - b) + corner(x - a, y - b)
+    return _corner(x + a, y + b) - _corner(x - a, y + b) - _corner(x + a, y - b) + _corner(x - a, y - b)
 
 
 def _sink(pressure: torch.Tensor, kernel: torch.Tensor) -> torch.Tensor:
@@ -324,7 +324,7 @@ def _solve(height: torch.Tensor, kernel: torch.Tensor) -> torch.Tensor:
     Conjugate gradients on the set in contact (Polonsky & Keer 1999). NaN where they do not converge.
     """
 
-    def dot(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    def _dot(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
         return (a * b).sum((1, 2), keepdim=True)
 
     tiny = torch.finfo(height.dtype).tiny
@@ -334,9 +334,9 @@ def _solve(height: torch.Tensor, kernel: torch.Tensor) -> torch.Tensor:
         gap = _sink(p, kernel) - height
         inside = p > 0
         residual = gap * inside
-        square = dot(residual, residual)
+        square = _dot(residual, residual)
         way = (residual + keep * square / before.clamp_min(tiny) * way) * inside
-        step = dot(residual, way) / dot(_sink(way, kernel), way).clamp_min(tiny)
+        step = _dot(residual, way) / _dot(_sink(way, kernel), way).clamp_min(tiny)
         new = (p - step * way).clamp_min(0)
         # Cells without pressure that the body would overlap come into contact, and the search begins anew.
         overlap = (new == 0) & (gap < 0) & ~inside

@@ -264,6 +264,7 @@ class RodEngine(WhiskerEngine):
         sizes = sorted(set(map(capacity_for, counts)))
 
         def load(capacity: int) -> None:
+            """Load the kernels for so many links, and tell the progress where they have to be compiled."""
             what = f"compiling the whisker solver for {capacity} links (once; it is kept)"
             tell = progress or (lambda done, total, what: None)
             real = real_type(fidelity)
@@ -367,6 +368,7 @@ def _simulate(
     fidelity = given[0].fidelity
 
     def launch(tries: Sequence[Try]) -> list[LaunchResult]:
+        """Return the result of each try, all from one launch, and count its processor time to its tasks."""
         parts = [np.arange(len(given)) if which is None else np.flatnonzero(which[:, 0]) for which, _ in tries]
         rows, counts = np.concatenate(parts), [len(part) for part in parts]
         finer = np.repeat([divisor for _, divisor in tries], counts)

@@ -358,22 +358,22 @@ class WhiskerSolver:
             # What a GPU holds of this launch is given back under the lock too.
             del scene, problems, results
 
-        def table(column: NDArray) -> NDArray:
+        def _table(column: NDArray) -> NDArray:
             whole = np.zeros(size, dtype=column.dtype)
             whole[jobs.row, jobs.column] = column
             return whole
 
         state = values["state"]
-        counts = {name: table(state[name]) for name in _COUNTS}
-        wrench, missed = values["wrench"], table(residual(state["miss"], state["load"]))
-        depth = table(state["depth"].astype(float)) / MILLI
+        counts = {name: _table(state[name]) for name in _COUNTS}
+        wrench, missed = values["wrench"], _table(residual(state["miss"], state["load"]))
+        depth = _table(state["depth"].astype(float)) / MILLI
         force = np.sqrt(np.einsum("...d,...d", wrench[..., :3], wrench[..., :3]))
-        peak, strongest = force.max(axis=1), table(self.strongest[jobs.whisker])
+        peak, strongest = force.max(axis=1), _table(self.strongest[jobs.whisker])
         strength, strong_at = _first_beyond(strongest, force, given.readings)
         facts = RunFacts(
             status=counts["status"],
             # Single precision rounds a late time; the reading at it must not pass for one before it.
-            failed=given.start + table(state["failed_at"].astype(float)) * (1 - 2e-7) / MILLI,
+            failed=given.start + _table(state["failed_at"].astype(float)) * (1 - 2e-7) / MILLI,
             strength=strength,
             strong_at=strong_at,
             strongest=strongest,
@@ -385,7 +385,7 @@ class WhiskerSolver:
             peak=peak,
             third=np.partition(force, -3, axis=1)[:, -3] if len(given.readings) >= FEWEST_READINGS else peak,
         )
-        result = LaunchResult(wrench, values["contact"], counts, depth, missed, judge(facts), table(jobs.finer))
+        result = LaunchResult(wrench, values["contact"], counts, depth, missed, judge(facts), _table(jobs.finer))
         result.displacement, result.seconds = values.get("displacement"), seconds
         if given.record_shape:
             result.points = np.moveaxis(values["points"].astype(float) / MILLI, 2, 0)

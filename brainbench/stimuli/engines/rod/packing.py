@@ -563,15 +563,15 @@ class PackedShapes:
     def arrays(self) -> dict[str, NDArray]:
         """Return what the kernel's ``ShapeArrays`` hold."""
 
-        def column(name: str, dtype: Any, shape: tuple[int, ...] = ()) -> NDArray:
+        def _column(name: str, dtype: Any, shape: tuple[int, ...] = ()) -> NDArray:
             some = [np.asarray(columns[name], dtype=dtype).reshape(-1, *shape) for columns in self.columns]
             return np.concatenate(some or [np.zeros((0, *shape), dtype=dtype)])
 
         return {
             "first": np.array(self.first, dtype=np.int32),
-            **{name: column(name, np.int32) for name in ("kind", "track", "face", "faces", "box")},
-            **{name: column(name, float) for name in ("scale", "radius", "speed", "friction")},
-            **{name: column(name, float, (width,)) for name, width in (("size", 3), ("place", 3), ("quaternion", 4))},
+            **{name: _column(name, np.int32) for name in ("kind", "track", "face", "faces", "box")},
+            **{name: _column(name, float) for name in ("scale", "radius", "speed", "friction")},
+            **{name: _column(name, float, (width,)) for name, width in (("size", 3), ("place", 3), ("quaternion", 4))},
             "boxes": np.concatenate([surface.boxes for surface in self.surfaces] or [np.zeros((1, 6, WIDE))]),
             "corners": np.concatenate([surface.corners for surface in self.surfaces] or [np.zeros((1, 9, WIDE))]),
             "outward": np.concatenate([surface.outward for surface in self.surfaces] or [np.zeros((1, 7, 3))]),

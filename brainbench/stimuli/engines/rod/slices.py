@@ -206,25 +206,25 @@ class Slices:
         wp, on, device, kernels = warp(), self.struct, self.device, self.kernels
         scene, problems, results = inputs
 
-        def launch(kernel: Any, threads: int, arguments: list[Any], block: int, stream: Any = self.stream) -> None:
+        def _launch(kernel: Any, threads: int, arguments: list[Any], block: int, stream: Any = self.stream) -> None:
             # Whole warps: the threads of a group speak with each other.
             threads = -(-threads // WARP) * WARP
             wp.launch(kernel, threads, arguments, device=device, stream=stream, block_dim=block)
 
         for _ in range(SLICES_PER_CHECK):
             for kernel in (kernels.run, kernels.go_on):
-                launch(kernel, left + 3 * WARP, [*scene, problems, on, results], block)
+                _launch(kernel, left + 3 * WARP, [*scene, problems, on, results], block)
                 # Twice a slice: both arrays are then back in place, so a recorded graph can be repeated.
                 on.queue, on.next_queue = on.next_queue, on.queue
                 wp.launch(kernels.swap_queues, 1, [on], device=device, stream=self.stream)
                 if kernel is kernels.run:
                     many = min(self.queries, self.capacity * left) * kernels.distance_group
                     many = min(-(-many // WARP) * WARP, MOST_THREADS)
-                    launch(kernels.measure_distances, many, [*scene[:4], on, many], limits.DISTANCE_BOUNDS[0])
+                    _launch(kernels.measure_distances, many, [*scene[:4], on, many], limits.DISTANCE_BOUNDS[0])
             for (kernel, threads), stream in zip(kernels.solve_contacts, self.streams, strict=True):
                 if stream is not None:
                     stream.wait_stream(self.stream)
-                launch(kernel, left * threads, [problems, on], limits.CONTACT_BOUNDS[0], stream or self.stream)
+                _launch(kernel, left * threads, [problems, on], limits.CONTACT_BOUNDS[0], stream or self.stream)
             for stream in self.streams:
                 if stream is not None:
                     self.stream.wait_stream(stream)

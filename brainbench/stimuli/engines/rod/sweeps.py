@@ -214,7 +214,7 @@ class SweepLauncher:
     ) -> LaunchResult:
         """Simulate sweeps, or some of their whiskers [sweep, whisker], and again with finer steps what needs these."""
 
-        def launch(tries: Sequence[Try]) -> list[LaunchResult]:
+        def _launch(tries: Sequence[Try]) -> list[LaunchResult]:
             some = [(mask, finer) for mask, finer in tries if mask is not None]
             if which is not None:
                 whole = [(which.copy(), finer) for _, finer in tries]
@@ -224,7 +224,7 @@ class SweepLauncher:
             result = self.launch(objects, some)
             return result.split([int(mask.sum()) for mask, _ in some] or [len(result.wrench)])
 
-        return run_with_retries(launch, retry)
+        return run_with_retries(_launch, retry)
 
     def _errors(
         self, objects: Sequence[tuple[str, Sequence[Any]]], result: LaunchResult, which: NDArray[np.bool_]
@@ -243,7 +243,9 @@ class SweepLauncher:
         lengths = np.array([one.arc_length for one in self.whiskers])[whisker]
 
         def square(factor: float, solver: WhiskerSolver, shift: NDArray[np.float64] | float) -> NDArray[np.float64]:
-            def launch(divisors: NDArray[np.integer]) -> LaunchResult:
+            """Return the squared error [whisker] by a finer solver, infinite where that run is unstable too."""
+
+            def _launch(divisors: NDArray[np.integer]) -> LaunchResult:
                 whole = np.zeros_like(result.divisor)
                 whole[which] = divisors
                 tries = [(whole == divisor, int(divisor)) for divisor in np.unique(divisors[divisors > 0])]
@@ -251,10 +253,10 @@ class SweepLauncher:
                 return self.launch(objects, tries, solver).picked(order)
 
             divisors = result.divisor[which]
-            finer = launch(divisors)
+            finer = _launch(divisors)
             left = finer.verdict.retryable.copy()
             if left.any():
-                finer = finer.replaced(left, launch(np.where(left[:, 0], 2 * divisors, 0)))
+                finer = finer.replaced(left, _launch(np.where(left[:, 0], 2 * divisors, 0)))
             change = changes(values, finer.wrench[:, :, 0], contact | (finer.contact[:, :, 0] >= 0), lengths, shift)
             return np.where(finer.verdict.unstable[:, 0], np.inf, factor * change) ** 2
 

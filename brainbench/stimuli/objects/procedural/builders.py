@@ -153,13 +153,13 @@ def superquadric(draw: ShapeSampler, detail: int) -> Body:
     vertical, around_z, y = draw(exponent_vertical=(0.25, 1.9), exponent_around=(0.25, 1.9), y_over_x=(0.7, 1.0))
     (z,) = draw(z_over_x=(0.6, 1.4))
 
-    def warp(points: np.ndarray) -> np.ndarray:
+    def _warp(points: np.ndarray) -> np.ndarray:
         # Along the ray of every point to the surface (|x|^(2/a) + |y|^(2/a))^(a/v) + |z|^(2/v) = 1.
         p = np.abs(points)
         flat = (p[:, 0] ** (2 / around_z) + p[:, 1] ** (2 / around_z)) ** (around_z / vertical)
         return points * ((flat + p[:, 2] ** (2 / vertical)) ** (-vertical / 2))[:, None]
 
-    return convex(ball(detail, warp)).stretched(1.0, y, z)
+    return convex(ball(detail, _warp)).stretched(1.0, y, z)
 
 
 def bumpy(draw: ShapeSampler, detail: int) -> Body:
@@ -172,12 +172,12 @@ def bumpy(draw: ShapeSampler, detail: int) -> Body:
     centres += 0.08 * draw.normals(count, 3)
     centres /= np.linalg.norm(centres, axis=1, keepdims=True)
 
-    def warp(points: np.ndarray) -> np.ndarray:
+    def _warp(points: np.ndarray) -> np.ndarray:
         # Angle between a point of the sphere and each bump.
         gap = np.arccos(np.clip(points @ centres.T, -1, 1))
         return points * (1 + height * np.exp(-((gap / width) ** 2)).sum(axis=1, keepdims=True))
 
-    return Body(ball(detail, warp), None)
+    return Body(ball(detail, _warp), None)
 
 
 def pebble(draw: ShapeSampler, detail: int) -> Body:
@@ -187,10 +187,10 @@ def pebble(draw: ShapeSampler, detail: int) -> Body:
     waves *= 1.8 / np.linalg.norm(waves, axis=1, keepdims=True)
     phase = draw.normals(6) * np.pi
 
-    def warp(points: np.ndarray) -> np.ndarray:
+    def _warp(points: np.ndarray) -> np.ndarray:
         return points * (1 + amount * np.cos(points @ waves.T + phase).mean(axis=1, keepdims=True) * 2)
 
-    return Body(ball(detail, warp), None).stretched(z=flat)
+    return Body(ball(detail, _warp), None).stretched(z=flat)
 
 
 def urchin(draw: ShapeSampler, detail: int) -> Body:

@@ -92,12 +92,12 @@ def _make(family: str, build: Callable[[ShapeSampler, int], Body], seed: int, de
     low, high = points.min(axis=0), points.max(axis=0)
     size, centre = float(np.linalg.norm(high - low)), (low + high) / 2
 
-    def unit(vertices: np.ndarray) -> np.ndarray:
+    def _unit(vertices: np.ndarray) -> np.ndarray:
         # Rounded, so that the last digit of a sine on another processor does not change the hash.
         return np.round((vertices - centre) / size, 9) + 0.0
 
-    mesh = Mesh(unit(points), np.array(data.tri_verts, dtype=np.int64), family)
-    return Shape(mesh, family, dict(draw.drawn), seed, tuple(unit(part) for part in body.parts or ()))
+    mesh = Mesh(_unit(points), np.array(data.tri_verts, dtype=np.int64), family)
+    return Shape(mesh, family, dict(draw.drawn), seed, tuple(_unit(part) for part in body.parts or ()))
 
 
 def _refined(solid: Manifold, detail: int) -> Manifold:

@@ -138,13 +138,11 @@ def chosen(name: str, sign: str) -> str:
 @wp.func_native(chosen("min", "<"))
 def minimum(a: real, b: real) -> real:
     """Return the smaller number; which one, if one is no number, depends on the machine."""
-    ...
 
 
 @wp.func_native(chosen("max", ">"))
 def maximum(a: real, b: real) -> real:
     """Return the larger number; which one, if one is no number, depends on the machine."""
-    ...
 
 
 def reader(*kinds: tuple[Any, Any]) -> Any:
@@ -152,7 +150,8 @@ def reader(*kinds: tuple[Any, Any]) -> Any:
     for memory, element in dict.fromkeys(kinds):
 
         @wp.func_native("return wp::extract(memory, index);")
-        def row(memory: wp.ref[memory], index: int) -> element: ...
+        def row(memory: wp.ref[memory], index: int) -> element:
+            """Return the element of a place in memory."""
 
     return row
 

@@ -256,7 +256,6 @@ def pass_joint(
     joints: wp.array(dtype=JointRecord), joint: int, twists: int, step: real, each: int, unit: wp.ref[UnitForces]
 ):
     """Carry the unit forces of a thread's ``each`` contacts over a joint, and find what they do to it."""
-    ...
 
 
 @wp.func_native(
@@ -290,13 +289,11 @@ def add_joint(
     matrix: wp.ref[DelassusRows],
 ):
     """Add a joint's part of G to the three columns of a contact, whose joint rates are given, from a row on."""
-    ...
 
 
 @wp.func_native(ROWS + f"for (int c = 0; c < 3 * count; c++) {LANES} matrix.c[c * stride + r] = zero;")
 def clear(matrix: wp.ref[DelassusRows], count: int, each: int):
     """Set the columns of some contacts to zero."""
-    ...
 
 
 @wp.func_native(
@@ -308,13 +305,11 @@ const real *g0 = matrix.c + 3 * contact * stride, *g1 = g0 + stride, *g2 = g1 + 
 )
 def add_rates(own: wp.ref[ThreadContacts], matrix: wp.ref[DelassusRows], contact: int, force: vec3, each: int):
     """Add to the rates at a thread's ``each`` contacts what a contact's force does there."""
-    ...
 
 
 @wp.func_native("return unit.joint_rate.data[hinge][r];")
 def joint_rate(unit: wp.ref[UnitForces], hinge: int, r: int) -> real:
     """Return what the unit force of a row does to a hinge; an index of Warp would copy all of them first."""
-    ...
 
 
 @wp.func(inline=True)

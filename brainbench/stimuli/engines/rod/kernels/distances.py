@@ -270,7 +270,6 @@ the former at both ends of the segment gives its distance."""
 )
 def segments(a: vec3, d1: vec3, p: vec3, d2: vec3) -> vec2:
     """Return s and t of the closest points of the segments a + s d1 and p + t d2."""
-    ...
 
 
 @wp.func_native(f"""
@@ -281,7 +280,6 @@ return rows;
 """)
 def triangle_corners(corners: wp.array(dtype=LeafCorners), face: int) -> mat33:
     """Return the corners of a triangle as rows, without a copy of its whole leaf."""
-    ...
 
 
 @wp.func
@@ -339,7 +337,6 @@ def way_out(shapes: ShapeArrays, face: int, v: real, w: real, x: vec3, distance:
 @wp.func_native(TRIANGLES + "wp::vec_t<2, real> at; point_triangle(x.c, p.c, q.c, r.c, at.c[0], at.c[1]); return at;")
 def triangle_place(x: vec3, p: vec3, q: vec3, r: vec3) -> vec2:
     """Return barycentric v and w of q and r of the point of a triangle that is closest to x."""
-    ...
 
 
 @wp.func

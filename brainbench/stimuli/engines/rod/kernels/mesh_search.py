@@ -165,7 +165,6 @@ def measure_triangles(
 
     ``first`` is the rank of the thread's first triangle among the ``count`` of the surface.
     """
-    ...
 
 
 @wp.func_native(
@@ -208,7 +207,6 @@ def bound_boxes(
     end: wp.ref[Kept],
 ):
     """Find how near the children of a node can be to the segment and to b; ``beyond`` where that is no matter."""
-    ...
 
 
 @wp.func_native(
@@ -229,7 +227,6 @@ return code;
 )
 def nearest_child(side: wp.ref[Kept], end: wp.ref[Kept], level: int, part: int, bounds: SearchBounds) -> int:
     """Return the bound of the nearest child that may hold something nearer, with its rank in the last three bits."""
-    ...
 
 
 @wp.func

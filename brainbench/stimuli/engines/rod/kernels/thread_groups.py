@@ -46,34 +46,27 @@ else:
     @wp.func_native(native(f"return __shfl_sync(0xffffffffu, value, source, {group_size});"))
     def broadcast(value: real, source: int) -> real:
         """Return the value of the thread ``source`` of the group."""
-        ...
 
     @wp.func_native(reduce("value += other;"))
     def group_sum(value: real) -> real:
         """Return the sum over the group."""
-        ...
 
     @wp.func_native(reduce("value = other > value ? other : value;"))
     def group_max(value: real) -> real:
         """Return the largest value of the group."""
-        ...
 
     @wp.func_native(reduce("value = other < value ? other : value;"))
     def group_min(value: real) -> real:
         """Return the smallest value of the group."""
-        ...
 
     @wp.func_native(reduce("value = other < value ? other : value;"))
     def group_min_int(value: int) -> int:
         """Return the smallest integer of the group."""
-        ...
 
     @wp.func_native(reduce("bits |= other;", "bits"))
     def group_or(bits: int) -> int:
         """Return the bits that any thread of the group has set."""
-        ...
 
     @wp.func_native(reduce("value = other > value ? other : value;", width=32))
     def warp_max(value: int) -> int:
         """Return the largest integer of the warp."""
-        ...
