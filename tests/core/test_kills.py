@@ -1,8 +1,8 @@
 """Commands killed at any instant, given again, end with the bytes of an unbroken run and leave nothing else.
 
 ``python -m tests.core.test_kills FOLDER NAME… --kills N`` loads the modules of a command once; every run is a fork, so
-that a kill hits the work and not the loading. It prints one JSON object for each; without arguments
-it prints the names.
+that a kill hits the work and not the loading. It prints one JSON object for each; without arguments it prints the
+names.
 """
 
 from __future__ import annotations
