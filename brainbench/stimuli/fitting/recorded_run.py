@@ -8,9 +8,9 @@ gravity), the joint springs k, lag = max(β, h), and the contact forces f at poi
 
 which is (M + h D + h² K) q̇⁺ = M q̇ + h (…) with the damping D = (lag − h) K: linearly implicit springs. Behind a bend of
 ``limits.FOLD`` a joint is stiffer. Then q̇⁺ = q̇ + h a and q⁺ = q + h q̇⁺; a quasi-static step forgets q̇⁺. A contact has a
-gap g, a normal n and the closing rate κ = min(−g, ``limits.CREVICE``)/h, of the bent rod at most ``limits.UNDONE``; with
-the velocity v of the skin against the object at the end of the step (the object's is that in the middle of the step, at
-the contact's present place), the Coulomb problem has one of three solutions at each:
+gap g, a normal n and the closing rate κ = min(−g, ``limits.CREVICE``)/h, of the bent rod at most ``limits.UNDONE``;
+with the velocity v of the skin against the object at the end of the step (the object's is that in the middle of the
+step, at the contact's present place), the Coulomb problem has one of three solutions at each:
 
     open       f = 0
     sticking   v = κ n,                                                            |f − n (n·f)| ≤ μ n·f
