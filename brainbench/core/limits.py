@@ -9,8 +9,9 @@ command line where options are made from the dataclass::
         order: Literal["first", "second"] = "first"
         corner: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
-A plain type is a limit too: ``float`` takes finite numbers, ``int`` whole ones, ``bool`` truth values, ``Literal`` one
-of its names, a tuple so many values of these. What stands behind another type is left to the class.
+A plain type is a limit too: ``float`` takes finite numbers, ``int`` whole ones, ``bool`` truth values, ``str`` texts,
+``Literal`` one of its names, a dataclass one of its own, a tuple so many values of these, a mapping names and such
+values. What stands behind another type is left to the class.
 
 Other values in words (``links=12``, ``goal.threshold=0.2``), those of a command, of a preset (``fast,links=12``) and of
 a list of faults, are read as the annotation of their field says: :func:`with_changes`.
@@ -28,7 +29,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform,
 
 import msgspec
 
-from brainbench.core.errors import UsageError, brief, check_name, check_number, check_once
+from brainbench.core.errors import UsageError, brief, check_kind, check_name, check_number, check_once
 
 Check = Callable[[str, Any], None]
 T = TypeVar("T")
@@ -205,13 +206,17 @@ def checker(annotation: Any, limit: msgspec.Meta | None = None) -> Check | None:
     if origin in (tuple, list, Sequence) and (limit is None or sized):
         return _values(origin is tuple and kinds[-1:] != (Ellipsis,), kinds, limit or Limit())
     if annotation is str:
-        return None if limit is None else lambda name, value: _check_text(name, value, limit)
+        return lambda name, value: _check_text(name, value, limit or Limit())
+    if origin is Mapping and limit is None:
+        return _mapping(checker(kinds[-1]))
     if limit is not None:
         raise TypeError(f"Limits stand behind a number, a text or a tuple, not behind {annotation}: {limit}.")
     if annotation is bool:
         return _check_truth
     if origin is Literal:
         return lambda name, value: check_name(name, value, kinds)
+    if isinstance(annotation, type) and is_dataclass(annotation):
+        return lambda name, value: check_kind(name, value, annotation, f"{annotation.__name__}(…)")
     return _union(kinds) if origin in (Union, UnionType) else None
 
 
@@ -243,12 +248,14 @@ def _union(kinds: Sequence[Any]) -> Check | None:
     if all(check is None for _, check in checks):
         return None
     allows_none = NoneType in kinds
+    parts = tuple(kind for kind in kinds if isinstance(kind, type) and is_dataclass(kind))
 
     def check(name: str, value: Any) -> None:
         """Raise :class:`UsageError` unless one of the kinds allows a value."""
         faults = []
         for kind, limit in checks if value is not None or not allows_none else ():
-            if limit is None and isinstance(kind, type) and not isinstance(value, kind):
+            plain = get_origin(kind) or kind
+            if (limit is None or kind in parts) and isinstance(plain, type) and not isinstance(value, plain):
                 continue
             try:
                 if limit is not None:
@@ -259,6 +266,8 @@ def _union(kinds: Sequence[Any]) -> Check | None:
         if faults:
             # Of a number or a tuple, a tuple is answered as one.
             raise faults[-1 if isinstance(value, tuple | list) else 0]
+        if parts and not (allows_none and value is None):
+            check_kind(name, value, parts, " or ".join(f"{part.__name__}(…)" for part in parts))
 
     return check
 
@@ -267,7 +276,7 @@ def _values(fixed: bool, kinds: Sequence[Any], limit: msgspec.Meta) -> Check | N
     checks = [checker(kind) for kind in kinds if kind is not Ellipsis]
     if all(check is None for check in checks) and not fixed and limit.min_length is limit.max_length is None:
         return None
-    noun = "values" if None in checks else "numbers"
+    noun = "numbers" if {arm for kind in kinds for arm in _arms(kind)} <= {int, float, NoneType, Ellipsis} else "values"
 
     def check(name: str, value: Any) -> None:
         """Raise :class:`UsageError` unless a value is a row whose length and values are allowed."""
@@ -286,9 +295,20 @@ def _values(fixed: bool, kinds: Sequence[Any], limit: msgspec.Meta) -> Check | N
     return check
 
 
+def _mapping(limited: Check | None) -> Check:
+    check_inner: Check = limited or (lambda name, value: None)
+
+    def check(name: str, value: Any) -> None:
+        """Raise :class:`UsageError` unless a value is a mapping whose values are allowed."""
+        check_kind(name, value, Mapping, "names and values")
+        for key, inner in value.items():
+            check_inner(f"{name} ({brief(key, quoted=False)})", inner)
+
+    return check
+
+
 def _check_text(name: str, value: Any, limit: msgspec.Meta) -> None:
-    if not isinstance(value, str):
-        raise UsageError(f"{name} must be a text; received {brief(value)}.")
+    check_kind(name, value, str, "a text")
     _check_length(name, value, limit, "characters")
 
 
@@ -332,8 +352,11 @@ def read_value(name: str, text: str, annotation: Any, present: Any = None) -> An
         raise UsageError(f"{name!r} is more than a number; change it in Python, with dataclasses.replace.")
     for kind in readable:
         try:
-            return _read(text, kind)
-        except (KeyError, ValueError):
+            value = _read(text, kind)
+            if get_origin(kind) is not Literal:  # the class itself names the nearest choice
+                check_value(name, value, kind)
+            return value
+        except (KeyError, ValueError, OverflowError):
             continue
     words = " or ".join(_words(kind) for kind in readable)
     now = "" if present is None else f", for instance {brief(present)}"
@@ -369,7 +392,7 @@ def _arms(annotation: Any) -> list[Any]:
 
 def _read(text: str, kind: Any) -> Any:
     if get_origin(kind) is Literal:
-        return text  # the class itself names the nearest choice
+        return text
     if get_origin(kind) is tuple:
         (inner,) = _arms(get_args(kind)[0])
         return tuple(_READ[inner][0](part.strip()) for part in text.split(","))
@@ -382,15 +405,8 @@ def _words(kind: Any) -> str:
     return _READ[kind][1]
 
 
-def _read_number(text: str) -> float:
-    number = float(text)
-    if not math.isfinite(number):
-        raise ValueError
-    return number
-
-
 def _whole(text: str) -> int:
-    number = _read_number(text)
+    number = float(text)
     if number != int(number):
         raise ValueError
     return int(number)
@@ -400,6 +416,6 @@ _READ: dict[Any, tuple[Any, str]] = {
     str: (str, "a text"),
     bool: (lambda text: {"true": True, "false": False}[text.lower()], "true or false"),
     int: (_whole, "a whole number"),
-    float: (_read_number, "a number"),
+    float: (float, "a number"),
 }
 """Kind → its reader, and its name in messages."""

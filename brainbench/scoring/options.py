@@ -25,10 +25,7 @@ if TYPE_CHECKING:
 
 TIME_BIN = 0.05  # bin width of scores over time, seconds
 
-_NO_NUMBERS = (
-    "recordings", "title", "stimuli", "conditions", "match", "select", "window", "whiskers", "fidelity", "metric",
-    "layer", "estimator", "plan", "benchmark", "by",
-)  # fmt: skip
+_OF_PYTHON = ("recordings", "stimuli", "match", "select", "window", "fidelity", "metric", "benchmark")
 """Fields that take much in Python, and a number nowhere; a batch file can hold one."""
 _ELSEWHERE = ("recordings", "match", "by", "explain", "title", "strict", "memory", "plan", "benchmark")
 """Fields whose effect stands in other entries of the provenance (``recordings``, ``pairs``, ``statistics``, ``plan``,
@@ -37,7 +34,7 @@ _ELSEWHERE = ("recordings", "match", "by", "explain", "title", "strict", "memory
 
 @limited(
     names={"time": "time rule"},
-    unresolved=("recordings", "stimuli", "match", "select", "window", "fidelity", "metric", "layers", "benchmark"),
+    unresolved=_OF_PYTHON,
 )
 class ScoreOptions:
     """Options of scoring a model against recordings."""
@@ -66,7 +63,7 @@ class ScoreOptions:
     fidelity: str | Fidelity | None = "balanced"
     """Simulation preset: balanced, accurate, or fast (to try things out; coarse RDMs); single values may follow, as in
     fast,links=12,time_step=5e-4."""
-    layers: tuple[str, ...] | None = None
+    layers: Annotated[tuple[str, ...], Limit(shortest=1)] | None = None
     """Comma-separated layers to compare; all by default."""
     layer: str | None = None
     """The layer committed to before anything is scored; by default the one that the model names, else a held-out
@@ -107,16 +104,12 @@ class ScoreOptions:
 
     def __post_init__(self) -> None:
         """Refuse what no score can be made with, before anything is loaded."""
-        for name in _NO_NUMBERS:
+        for name in _OF_PYTHON:
             if isinstance(getattr(self, name), (int, float)):
                 raise UsageError(f"{name} must be a text; received {brief(getattr(self, name))}.")
         if isinstance(self.match, os.PathLike) and os.fspath(self.match) == BY_TRIAL:  # as the command line states it
             object.__setattr__(self, "match", BY_TRIAL)
         if self.layers is not None:
-            if not (isinstance(self.layers, (list, tuple)) and all(isinstance(name, str) for name in self.layers)):
-                raise UsageError(f"layers must be a list of names; received {brief(self.layers)}.")
-            if not self.layers:
-                raise UsageError("layers names none; leave it out for all.")
             check_once("layers", self.layers)
             object.__setattr__(self, "layers", tuple(self.layers))
         if not isinstance(self.recordings, (str, os.PathLike, Sequence)):

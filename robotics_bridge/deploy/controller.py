@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, check_each, check_number, listing
 from brainbench.core.files import file_hash
-from brainbench.core.limits import Limit, check_value, limited
+from brainbench.core.limits import Limit, limited
 from robotics_bridge import hands
 from robotics_bridge.deploy.driver import Clock, Driver, HandReading, Source
 from robotics_bridge.deploy.safety import SafeLink, SafetyLimits
@@ -301,8 +301,6 @@ class PressureCalibration:
     """Contact pressure, in the maker's unit, above which a finger touches (η_real of 4.31)."""
 
     def __post_init__(self) -> None:
-        for name, factor in self.per_finger.items():
-            check_value(f"'{name}' of a pressure calibration", factor, _Scale)
         factors = [("scale", self.scale), *self.per_finger.items(), *(("axes", factor) for factor in self.axes)]
         if zero := [name for name, factor in factors if factor == 0]:
             raise UsageError(f"{zero[0]!r} of a pressure calibration must not be 0; received 0.")

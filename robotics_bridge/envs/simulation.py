@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from brainbench.core.devices import Recorder, mujoco_module, no_collection, pick_device, warp
-from brainbench.core.errors import UsageError, check_kind
+from brainbench.core.errors import UsageError
 from brainbench.core.limits import Count, Limit, limited
 from brainbench.core.rotations import conjugate, from_xyzw, rotate
 from robotics_bridge.envs.kernels.actuation import ActuatorArrays, actuate, add_contact_forces
@@ -72,7 +72,6 @@ class EnvOptions:
     """
 
     def __post_init__(self) -> None:
-        check_kind("device", self.device, str, "'cpu', 'cuda' or 'cuda:N'")
         object.__setattr__(self, "engine", self.engine or ("mujoco" if self.device == "cpu" else "warp"))
         observation_type(self.observe)
         check_names("low" if self.resolution == "custom" else self.resolution, self.placement)

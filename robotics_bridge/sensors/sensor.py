@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-from brainbench.core.errors import UsageError, check_kind, check_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.core.files import read_json
 from brainbench.core.limits import Count, Limit, limited
 from brainbench.core.tradeoffs import TradeoffPoint, cheapest
@@ -47,8 +47,6 @@ class Sensor(abc.ABC):
     """``package.module:Class`` of the runtime that serves those of one group, imported when a suite is built."""
 
     def __post_init__(self) -> None:
-        check_kind("link of a sensor", self.link, str, "a name")
-        check_kind("noise of a sensor", self.noise, Noise, "Noise(...)")
         self.noise.check(self.knobs, type(self).__name__)
 
     @abc.abstractmethod
@@ -102,8 +100,6 @@ class ProbeSensor(Sensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_kind("probes of a sensor", self.probes, Probes, "Probes(...)")
-        check_kind("track", self.track, (tuple, list), "the names of links, such as ('object',)")
         # Sensors are told apart by what they track, so that it must be hashable.
         object.__setattr__(self, "track", tuple(self.track))
 

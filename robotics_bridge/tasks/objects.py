@@ -9,11 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Annotated, Any
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError, check_name, check_number
-from brainbench.core.limits import Positive, limited
+from brainbench.core.limits import Limit, Positive, limited
 from robotics_bridge.physics import Geometry
 from robotics_bridge.tasks.settings import unit_vector
 
@@ -27,7 +27,7 @@ class ObjectShape:
     """One object: its solids and its outer measures."""
 
     name: str
-    solids: tuple[Geometry, ...]
+    solids: Annotated[tuple[Geometry, ...], Limit(shortest=1)]
     """Boxes, cylinders, capsules and spheres in the body's frame."""
     extent: tuple[Positive, Positive, Positive]
     """Edges of the box around it, along the body's axes [m]."""
@@ -37,8 +37,6 @@ class ObjectShape:
     """Axis of the body about which the shape looks the same from everywhere, made unit length; None without one."""
 
     def __post_init__(self) -> None:
-        if not self.solids:
-            raise UsageError(f"The object {self.name!r} needs at least one solid.")
         for solid in self.solids:
             check_name(f"kind of a solid of {self.name!r}", solid.kind, _SIZES)
             check_number(f"size of the {solid.kind} of {self.name!r} in metres", max(solid.size), most=LARGEST)

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from brainbench.core.errors import UsageError, check_each, check_name, check_number, check_numbers
-from brainbench.core.limits import Count, Limit, NotNegative, Positive, check_value, limited
+from brainbench.core.errors import UsageError, check_each, check_name
+from brainbench.core.limits import Count, Limit, NotNegative, Positive, limited
 from brainbench.core.rotations import TURN
 from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.goals import Goal
@@ -35,7 +35,7 @@ Pose = tuple[tuple[float, float, float], tuple[float, float, float, float]]
 """Position (m) and quaternion (w, x, y, z)."""
 
 
-@dataclass(frozen=True)
+@limited(of="{} of a reward")
 class Reward:
     """A term of the reward."""
 
@@ -176,7 +176,7 @@ class Task:
     episode: Positive = 10.0
     """Longest duration [s]."""
     # --- scene ---
-    objects: tuple[ObjectShape, ...] = PRIMITIVES
+    objects: Annotated[tuple[ObjectShape, ...], Limit(shortest=1)] = PRIMITIVES
     """Shapes of the object, spread over environments in turn."""
     copies: Count = 1
     """Objects in the scene; more than one are equal but for what ``task_state`` makes of them."""
@@ -254,14 +254,11 @@ class Task:
                 f"{self.contacts.time_constant:g}: take more contacts.substeps."
             )
         for name, reward in self.rewards.items():
-            check_number(f"weight of {name!r} {of}", reward.weight)
             check_parameters(f"reward {name!r} {of}", reward.term, reward.params)
             if reward.term is terms.ended:
                 check_each(f"ending in reward {name!r} {of}", reward.params["names"], self.endings)
         for name, ending in self.endings.items():
             check_parameters(f"ending {name!r} {of}", ending.condition, ending.params)
-        if not self.objects:
-            raise UsageError(f"Task {self.name!r} needs at least one object.")
         if self.task_state is None:
             check_name(f"success.metric {of} without task_state", self.success.metric, ("goals", "turned"))
         if self.success.metric == "turned" and self.turn_axis is None:
@@ -275,17 +272,11 @@ class Task:
     def _check_places(self, of: str) -> None:
         poses = {}
         for hand, (place, quaternion) in self.hand_poses.items():
-            check_numbers(f"The place of {hand!r} in hand_poses {of}", place, 3)
             poses[hand] = (tuple(place), unit_vector(f"The quaternion of {hand!r} in hand_poses {of}", quaternion, 4))
         object.__setattr__(self, "hand_poses", poses)
         if self.turn_axis is not None:
             object.__setattr__(self, "turn_axis", unit_vector(f"turn_axis {of}", self.turn_axis, 3))
-        for hand, joints in self.joints.items():
-            for joint, position in joints.items():
-                check_number(f"joint {joint!r} of {hand!r} {of} (rad)", position)
-        for axis, slide in self.carriage.items():
-            check_name(f"axis of the carriage {of}", axis, ("x", "y", "z"))
-            check_value(f"carriage.{axis} {of}", slide, _Slide)
+        check_each(f"axis of the carriage {of}", self.carriage, ("x", "y", "z"))
 
     @property
     def step_dt(self) -> float:

@@ -51,7 +51,7 @@ def test_finished_stimuli_state_no_fidelity():
 
 
 def test_a_layer_is_named_once():
-    with pytest.raises(UsageError, match="layers names none"):
+    with pytest.raises(UsageError, match="layers holds at least 1 value"):
         ScoreOptions.of({"layers": []})
     with pytest.raises(UsageError, match="'conv1' more than once"):
         ScoreOptions(layers=("conv1", "fc", "conv1"))
@@ -86,7 +86,7 @@ def test_a_fidelity_of_the_callers_own_comes_back_from_the_settings_of_a_record(
 @pytest.mark.parametrize("wrong", ["fc", ("fc", 5), 5])
 def test_layers_are_a_list_of_names(wrong):
     assert ScoreOptions(layers=["fc"]).layers == ("fc",)
-    with pytest.raises(UsageError, match="layers must be a list of names"):
+    with pytest.raises(UsageError, match=r"layers holds values|layers must be a text"):
         ScoreOptions(layers=wrong)
 
 

@@ -56,11 +56,8 @@ def fault_in_words(fault: str, data: Any, where: str, choices: Mapping[str, Sequ
     return f"{place or where} is {repr(data)[:60]}; {allowed}"
 
 
-_TABLES = {
-    "list": "a list of tables in double brackets", "tuple[str": "a list of texts", "tuple": "a list of tables",
-    "dict": "a table", "str": "a text",
-}  # fmt: skip
-"""Beginnings of types that hold no numbers, in words."""
+_TABLES = {"list": "a list of tables in double brackets", "tuple": "a list of tables", "dict": "a table"}
+"""Beginnings of types of tables, in words."""
 
 
 def read_table(kind: type[Table], data: Any, name: str) -> Table:

@@ -117,12 +117,6 @@ _RULE = re.compile(r"^\s*(?:(?P<scope>trials|units)\.)?(?P<column>[^=!<>]+?)\s*(
 _RANGE = re.compile(r"^(?P<low>[-+.\deE]*)\.\.(?P<high>[-+.\deE]*)$")
 
 
-def _check_texts(what: str, texts: Any) -> None:
-    # A text is a sequence too: of its letters.
-    if isinstance(texts, str) or not all(isinstance(text, str) for text in texts):
-        raise UsageError(f"{what} must be a tuple of texts; received {brief(texts)}.")
-
-
 @limited(of="{} of a rule")
 class Rule:
     """One condition on one column; rows that fail it are removed and counted.
@@ -144,8 +138,6 @@ class Rule:
     """False: a table without the column passes, and the result says that the rule did not apply."""
 
     def __post_init__(self) -> None:
-        for name in ("allow", "refuse"):
-            _check_texts(f"{name} of the rule on {self.column!r}", getattr(self, name))
         values = (*self.allow, *self.refuse)
         if not all(values) or (not values and self.low is None and self.high is None):
             raise UsageError(f"The rule on {self.column!r} has an empty value; write a|b or low..high.")
@@ -208,9 +200,6 @@ class Selection:
     subjects: tuple[str, ...] = ()
     """Keep only these subjects; empty keeps all."""
     name: str = "custom"
-
-    def __post_init__(self) -> None:
-        _check_texts("subjects", self.subjects)
 
     @classmethod
     def parse(cls, source: str) -> Selection:

@@ -6,12 +6,12 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar, Self, get_args
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError
 from brainbench.core.limits import NotNegative, limited
 from brainbench.core.rotations import Length, Point, from_matrices, to_matrices
 from brainbench.geometry import Mesh
@@ -184,8 +184,6 @@ class Obstacle:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parts", tuple(self.parts))
-        for part in self.parts:
-            check_name("part of an obstacle", type(part).__name__, [kind.__name__ for kind in get_args(Part)])
         if not self.parts and self.surface is None:
             raise UsageError("An obstacle needs at least one part or a surface.")
         if self.surface is not None and min(len(self.surface.vertices), len(self.surface.faces)) < 4:

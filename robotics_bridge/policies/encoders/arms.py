@@ -244,8 +244,6 @@ class EncoderConfig:
     """Force and moment that are one unit to a network."""
 
     def __post_init__(self) -> None:
-        if not isinstance(self.name, str):
-            raise unknown_name("tactile encoder", self.name, ARMS)
         # Equal to its default a setting may stand anywhere: a configuration in a file holds them all.
         owner = {"units": "'rnn'"} if self.arm != "rnn" else {}
         owner |= dict.fromkeys(_OF_NETWORKS, "a network (brainbench models list)") if self.arm in ARMS else {}

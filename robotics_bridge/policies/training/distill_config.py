@@ -107,8 +107,6 @@ class DistillConfig:
         object.__setattr__(self, "hidden", tuple(self.hidden))
         kind = observation_type(self.observe)
         check_names(self.resolution, self.placement)
-        if not isinstance(self.encoder_settings, Mapping):
-            raise UsageError(f"'encoder_settings' must be names and values; received {brief(self.encoder_settings)}.")
         defaults = {item.name: item.default for item in fields(self)} | {"encoder_settings": {}}
         if idle := [name for name in FELT if kind.sensor is None and getattr(self, name) != defaults[name]]:
             raise UsageError(f"A student that observes {self.observe!r} has no touch; leave out {listing(idle)}.")

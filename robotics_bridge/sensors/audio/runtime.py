@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from brainbench.core.devices import warp
-from brainbench.core.errors import UsageError, check_kind, check_number
+from brainbench.core.errors import UsageError, check_number
 from brainbench.core.limits import NotNegative, Positive, limited
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.audio.sensors import ActuationAudio, AudioSensor, ContactAudio
@@ -185,9 +185,6 @@ class Microphone:
     """Sources nearer than this are as loud as at this distance [m]."""
     reach: Positive = 3.0
     """Longest distance that is rendered with its full delay [m]; sets the memory."""
-
-    def __post_init__(self) -> None:
-        check_kind("sources", self.sources, (tuple, list), "the names of sensors, such as ('tip',)")
 
     def build(self, suite: SensorSuite) -> Listener:
         """Return the listener of a suite; call its ``update`` after the suite's."""

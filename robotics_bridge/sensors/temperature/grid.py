@@ -16,7 +16,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError, check_kind, check_number
+from brainbench.core.errors import UsageError, check_number
 from brainbench.core.limits import Count, Limit, NotNegative, Positive, limited
 from brainbench.core.rotations import to_matrices
 from robotics_bridge.physics.scene import Geometry, TouchScene
@@ -81,8 +81,7 @@ class TemperatureGrid(Sensor):
             raise UsageError(f"source is a number or an array {tuple(self.cells)}; received {np.shape(self.source)}.")
         for value in np.ravel(self.source):
             check_number("source", value)
-        for name, body in {**self.bodies, "unlisted": self.unlisted}.items():
-            check_kind(f"body {name!r}", body, ThermalBody, "ThermalBody(material, temperature)")
+        for body in (*self.bodies.values(), self.unlisted):
             material(body.material)
         material(self.material)
 

@@ -73,7 +73,7 @@ def test_tables_within_a_table_become_structures():
         ({"frist": {}}, "key of the file 'frist'; did you mean 'first'"),
         ({"first": {}}, r"\[first\] of the file needs the key 'size'"),
         ({"first": {"size": 0}}, r"'size' of \[first\] of the file must be a whole number, at least 1"),
-        ({"part": [{"size": 1, "names": "a"}]}, r"'names' of \[\[part\]\] of the file must be a list of texts"),
+        ({"part": [{"size": 1, "names": "a"}]}, r"'names' of \[\[part\]\] of the file holds values; received 'a'"),
         ({"part": {"size": 1}}, "'part' of the file must be a table of tables"),
     ],
 )

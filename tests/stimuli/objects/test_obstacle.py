@@ -68,7 +68,7 @@ def test_a_quarter_turn_about_z_takes_x_to_y():
         (lambda: Obstacle(()), "at least one part"),
         (lambda: Obstacle((), surface=Mesh(np.zeros((3, 3)), np.zeros((4, 3), int))), "at least four vertices"),
         (lambda: Obstacle((), surface=Mesh(np.eye(4, 3), np.array([[0, 1, 2]]))), "four faces"),
-        (lambda: Obstacle(("ball",)), "part of an obstacle 'str'"),  # pyright: ignore[reportArgumentType]
+        (lambda: Obstacle(("ball",)), r"parts of an obstacle must be .*Box\(…\).*received 'ball'"),  # pyright: ignore[reportArgumentType]
     ],
 )
 def test_impossible_shapes_are_refused(make, message):

@@ -18,11 +18,11 @@ from robotics_bridge.policies.training.distill_config import PUBLISHED, DistillC
         ({"observe": "none", "placement": "tips", "noisy": True}, "leave out 'placement', 'noisy'"),
         ({"observe": "none", "encoder_settings": {"seed": 1}}, "leave out 'encoder_settings'"),
         ({"noisy": "no"}, "'noisy' of a student must be True or False; received 'no'"),
-        ({"encoder_settings": []}, "'encoder_settings' must be names and values"),
+        ({"encoder_settings": []}, "'encoder_settings' of a student must be names and values"),
         ({"placement": "tip"}, "did you mean 'tips'"),
         ({"resolution": "mid"}, "did you mean 'med'"),
         ({"teacher_iterations": 5}, "'teacher_share' falls, and that is 0"),
-        ({"encoder": 5}, "tactile encoder 5"),
+        ({"encoder": 5}, "'encoder' of a student must be a text; received 5"),
     ],
 )
 def test_settings_of_a_student_that_reach_nothing_are_refused(options, told) -> None:
