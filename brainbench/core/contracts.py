@@ -317,9 +317,6 @@ def join_labels(
 def read_match(path: str | os.PathLike[str]) -> dict[str, str | None]:
     """Read label pairs from JSON or TOML (an object) or CSV (two columns; an empty second one drops)."""
     path = Path(path)
-    if not path.is_file():
-        single = f"; {BY_TRIAL!r} joins the single trials of a score, and only that" if str(path) == BY_TRIAL else ""
-        raise UsageError(f"There is no match file {str(path)!r}{single}.")
     kind = path.suffix.lower()
     if kind in (".json", ".toml"):
         pairs = read_mapping(path)
@@ -332,7 +329,8 @@ def read_match(path: str | os.PathLike[str]) -> dict[str, str | None]:
         check_once(repr(str(path)), [row[0] for row in rows])
         pairs = dict(rows)
     else:
-        raise UsageError(f"A match file ends in .json, .toml or .csv; received {path.name!r}.")
+        single = f"; {BY_TRIAL!r} joins the single trials of a score, and only that"
+        raise UsageError(f"A match file ends in .json, .toml or .csv; received {path.name!r}{single}.")
     if not all(isinstance(value, (str, type(None))) for value in pairs.values()):
         raise UsageError(f"{str(path)!r} must map recording labels to stimulus labels (text, or null to drop one).")
     return {str(key): value or None for key, value in pairs.items()}

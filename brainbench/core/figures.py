@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import UsageError, listing, nearest, needing
+from brainbench.core.errors import check_name, needing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -70,11 +70,6 @@ def style_axes(axes: Any) -> None:
 
 def check_format(path: Path, allowed: Iterable[str]) -> str:
     """Return the lower-case suffix of ``path``; one that is not ``allowed`` is a :class:`UsageError`."""
-    choices = list(allowed)
     suffix = path.suffix.lower()
-    if suffix not in choices:
-        guess = nearest(suffix, choices)
-        hint = f"; did you mean {guess!r}?" if guess else "."
-        received = f"the name {path.name!r} ends in {suffix!r}" if suffix else f"the name {path.name!r} has no ending"
-        raise UsageError(f"A picture's name ends in its format; {received}{hint} Allowed: {listing(choices)}.")
+    check_name("format of a picture", suffix or path.name, allowed, hint="The ending of its name chooses it.")
     return suffix

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypeGuard
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import DataError, UsageError
+from brainbench.core.errors import UsageError, check_number
 from brainbench.core.lazy import lazy_module
 from brainbench.core.records import Interval, Score
 
@@ -97,8 +97,7 @@ def _spread(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def wilson_interval(successes: float, count: int, *, over: str = "trials", level: float = LEVEL) -> Interval:
     """Return Wilson's score interval of a proportion of independent trials (Wilson 1927)."""
-    if count < 1:
-        raise DataError("A proportion needs at least one observation.")
+    check_number("The number of observations of a proportion", count, least=1, whole=True)
     # A share times a count may lie beyond by its last digit.
     if not -1e-9 <= successes <= count + 1e-9:
         raise UsageError(f"Of {count:,} observations {successes} cannot be successes.")

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import DataError, UsageError, brief, check_name, check_number, unknown_name
+from brainbench.core.errors import DataError, UsageError, brief, check_name, check_number
 from brainbench.core.files import atomic_path, content_hash, without_last_digits
 from brainbench.core.lazy import lazy_module
 from brainbench.core.reading.regular import MOST_PART, check_file, part_of, readable
@@ -474,10 +474,10 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh, *, unit: str) -> Path:
     """
     check_name("length unit", unit, UNITS)
     path = Path(path)
-    if path.suffix.lower() not in WRITABLE:
-        raise unknown_name("mesh format", path.suffix or path.name, WRITABLE, hint="The suffix of the file chooses it.")
+    suffix = path.suffix.lower()
+    check_name("mesh format", suffix or path.name, WRITABLE, hint="The suffix of the file chooses it.")
     with atomic_path(path) as temporary:
-        mesh.scaled(1 / UNITS[unit]).to_trimesh().export(temporary, file_type=path.suffix[1:].lower())
+        mesh.scaled(1 / UNITS[unit]).to_trimesh().export(temporary, file_type=suffix[1:])
     return path
 
 

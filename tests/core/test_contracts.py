@@ -160,7 +160,7 @@ def test_a_wrong_match_file_is_refused(tmp_path: Path, name: str, text: str, mes
     (tmp_path / name).write_text(text)
     with pytest.raises((UsageError, DataError), match=message):
         read_match(tmp_path / name)
-    with pytest.raises(UsageError, match=r"/none\.json'"):
+    with pytest.raises(DataError, match=r"/none\.json'"):
         read_match(tmp_path / "none.json")
 
 

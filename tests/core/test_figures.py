@@ -40,7 +40,7 @@ def test_panels_have_the_size_that_was_asked_for_and_the_common_style():
 
 def test_a_format_is_told_by_the_ending_of_the_name():
     assert check_format(Path("A.PNG"), [".png", ".svg"]) == ".png"
-    with pytest.raises(UsageError, match=r"'a\.pgn' ends in '\.pgn'; did you mean '\.png'"):
+    with pytest.raises(UsageError, match=r"'\.pgn'; did you mean '\.png'"):
         check_format(Path("a.pgn"), [".png", ".svg"])
-    with pytest.raises(UsageError, match=r"'chart' has no ending\. Allowed: '\.png', '\.svg'"):
+    with pytest.raises(UsageError, match=r"Unknown format of a picture 'chart'\. Allowed: '\.png', '\.svg'"):
         check_format(Path("chart"), [".png", ".svg"])

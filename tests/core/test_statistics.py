@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from brainbench.core.errors import DataError, UsageError
+from brainbench.core.errors import UsageError
 from brainbench.core.records import Score
 from brainbench.core.statistics import paired_differences, t_interval, two_factor_error, wilson_interval
 
@@ -11,7 +11,7 @@ def test_wilson_equals_a_published_value():
     interval = wilson_interval(10, 100)
     assert (interval.low, interval.high) == pytest.approx((0.0552, 0.1744), abs=5e-5)
     assert all(wilson_interval(count, count).high == 1 and wilson_interval(0, count).low == 0 for count in range(1, 99))
-    with pytest.raises(DataError, match="at least one observation"):
+    with pytest.raises(UsageError, match="at least 1; received 0"):
         wilson_interval(0, 0)
 
 

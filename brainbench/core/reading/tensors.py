@@ -60,8 +60,6 @@ def check_archive(archive: zipfile.ZipFile, path: str | os.PathLike[str], kind: 
     members, name = archive.infolist(), brief(os.fspath(path))
     if twice := repeats(item.filename for item in members):
         raise DataError(f"{name} holds {listing(twice, limit=3)} twice, of which one would be read; write it again.")
-    if locked := [item.filename for item in members if item.flag_bits & 1]:
-        raise DataError(f"{name} is encrypted ({listing(locked, limit=3)}); save it without a password.")
     unpacked = sum(item.file_size for item in members)
     if unpacked > MOST_MEMORY + MOST_EXPANSION * Path(path).stat().st_size:
         raise DataError(f"{name} unpacks to {unpacked:,} bytes; it is damaged or no {kind}.")

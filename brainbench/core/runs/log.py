@@ -12,9 +12,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.errors import DataError, MissingDependencyError, check_name, install_command, missing_dependency
+from brainbench.core.errors import MissingDependencyError, check_name, install_command, missing_dependency
 from brainbench.core.files import write_text
 from brainbench.core.reading.regular import check_file, readable
+from brainbench.core.reading.texts import read_text
 
 _log = logging.getLogger(__name__)
 
@@ -137,8 +138,7 @@ def trim_log(path: Path, counter: str, last: int) -> None:
 def read_log(folder: str | Path, kind: str) -> list[dict[str, Any]]:
     """Return the lines of one kind (``train``, ``epoch``, ``validation``, ``test``) of a run's log."""
     path = Path(folder) / LOG
-    if not path.is_file():
-        raise DataError(f"There is no log {str(path)!r}.")
+    text = read_text(path, "log of a run")
     with readable(path, "log of a run"):
-        lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        lines = [json.loads(line) for line in text.splitlines()]
         return [line for line in lines if line["kind"] == kind]
