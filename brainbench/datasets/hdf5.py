@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import check_counts
-from brainbench.core.errors import DataError, UsageError, brief, listing
+from brainbench.core.errors import DataError, UsageError, brief, check_kind, listing
 from brainbench.core.files import create_hdf5, to_json
 from brainbench.core.reading.texts import parse_json
 from brainbench.datasets.sessions import SPIKES, LostColumn, Series, Session, SessionTable, decode, text
@@ -147,8 +147,8 @@ def _write_counts(file: h5py.File, dataset: xr.Dataset) -> None:
 def _write_sessions(file: h5py.File, sessions: list[Session]) -> None:
     if not sessions:
         raise UsageError("There is no session to write; pass at least one.")
-    if strangers := [session for session in sessions if not isinstance(session, Session)]:
-        raise UsageError(f"Recordings are a data set or sessions of make_session; received {brief(strangers[0])}.")
+    for session in sessions:
+        check_kind("recordings to write", session, Session, "a data set or sessions of make_session")
     file.attrs["kind"] = "responses" if any(RESPONSE in session.populations for session in sessions) else "spikes"
     root = file.create_group("sessions")
     for session in sessions:

@@ -16,7 +16,15 @@ from typing import TYPE_CHECKING
 
 import h5py
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, brief, nearest, unknown_name
+from brainbench.core.errors import (
+    DataError,
+    DataFileNotFoundError,
+    UsageError,
+    brief,
+    check_kind,
+    nearest,
+    unknown_name,
+)
 from brainbench.core.plugins import load_optional
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.regular import check_file, user_path
@@ -53,8 +61,7 @@ def find_recordings(source: Source, ledger: Ledger | None = None) -> tuple[Recor
     it is a bare word of at least two letters (so drive letters stay paths) and no file of the whole name exists. Raises
     DataFileNotFoundError: the source names nothing; UsageError: it names an unknown layout, or a layout and no file.
     """
-    if not isinstance(source, (str, os.PathLike, Sequence)):
-        raise UsageError(f"Recordings are a file, a folder, a glob or a list of these; received {brief(source)}.")
+    check_kind("source of recordings", source, (str, os.PathLike, Sequence), "a file, folder, glob or list of these")
     prefix, colon, rest = source.partition(":") if isinstance(source, str) else ("", "", "")
     in_file = prefix.endswith(".py")
     if not (in_file or is_name(prefix)) or rest.startswith("//") or not colon or Path(str(source)).exists():
@@ -62,8 +69,6 @@ def find_recordings(source: Source, ledger: Ledger | None = None) -> tuple[Recor
     layout = load_layout(prefix) if in_file else None
     if not rest:
         raise UsageError(f"The source {source!r} names a layout but no file; write {prefix}:PATH.")
-    if rest in _DEMOS:
-        raise UsageError(f"The demo recordings have a layout of their own; write {rest!r} without {prefix}:.")
     return layout or get_layout(prefix), find_files(rest, ledger)
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 
 from brainbench.core.contracts import check_recordings
-from brainbench.core.errors import DataError, UsageError, check_each, listing, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_each, listing
 from brainbench.core.progress import Progress, track
 from brainbench.core.reading.hdf5 import MissingFilterError
 from brainbench.datasets import hdf5
@@ -118,8 +118,6 @@ class _Reader:
     counted: list[SessionCounts] = field(default_factory=list)
     copies: Copies = field(default_factory=Copies)
     first: str = ""  # source of the session for which the options were made
-    other_tables: dict[str, str] = field(default_factory=dict)
-    """Why each session without the table of the conditions is left out, by one of the tables that it has."""
     subjects: dict[str, str] = field(default_factory=dict)
     """Every animal of the files → why it is left out; empty for one that is read."""
 
@@ -155,9 +153,7 @@ class _Reader:
             return no_units(session), True
         table = None if self.conditions is None else self.conditions.table
         if self.lenient and table is not None and table not in session.tables:
-            why = f"{session.source} has no table {table!r}; its tables: {listing(session.tables)}"
-            self.other_tables |= dict.fromkeys(session.tables or ("none",), why)
-            return why, True
+            return f"{session.source} has no table {table!r}; its tables: {listing(session.tables)}", True
         options = self._options_for(session, session_layout)
         if options.selection.subjects and session.subject not in options.selection.subjects:
             return f"{session.subject} is not among the chosen animals", False
@@ -197,8 +193,6 @@ class _Reader:
     def dataset(self, source: str) -> xr.Dataset:
         """Join what was counted; see :func:`open_recordings`."""
         skipped = self.ledger.skipped
-        if self.options is None and self.other_tables and self.conditions is not None:
-            raise unknown_name("table", self.conditions.table, self.other_tables)
         if self.options is None:
             more = f" ({len(skipped) - 1} more likewise)" if len(skipped) > 1 else ""
             raise DataError(f"{skipped[0]}{more}" if skipped else "The file holds no session.")

@@ -83,7 +83,7 @@ def test_proposals_count_only_the_trials_that_the_layout_selects(tmp_path):
 def test_a_layout_can_be_named_before_the_path(tmp_path):
     path = write_rodgers(tmp_path / "a.h5", **detection())
     assert inspect(f"rodgers-detection:{path}").layout == "rodgers-detection"
-    with pytest.raises(UsageError, match="write 'demo' without"):
+    with pytest.raises(UsageError, match="ask for recordings='demo'"):
         inspect("rodgers-detection:demo")
 
 

@@ -68,7 +68,7 @@ def test_sessions_without_the_table_are_skipped_with_the_reason_and_refused_when
     assert "epochs" in reason
     with pytest.raises(UsageError, match="trials"):
         open_recordings(tmp_path, conditions="trials:kind", strict=True)
-    with pytest.raises(UsageError, match=r"'trails'.*trials"):
+    with pytest.raises(DataError, match=r"no table 'trails'; its tables: 'trials'"):
         open_recordings(tmp_path, conditions="trails:kind")
 
 

@@ -60,7 +60,7 @@ def test_globs_lists_and_layouts_name_sources(tmp_path):
         open_recordings(f"rodgrs:{tmp_path}")
     with pytest.raises(UsageError, match=r"'rodgers:' .*rodgers:PATH"):
         open_recordings("rodgers:")
-    with pytest.raises(UsageError, match="write 'demo'"):
+    with pytest.raises(UsageError, match="ask for recordings='demo'"):
         open_recordings("rodgers:demo")
     with pytest.raises(UsageError, match="simulated stimuli"):
         open_recordings("demo")

@@ -25,7 +25,6 @@ from brainbench.core.errors import (
     UsageError,
     check_name,
     install_command,
-    unknown_name,
 )
 from brainbench.core.plugins import load_entry_points, load_module
 from brainbench.datasets.sessions import Session
@@ -236,9 +235,6 @@ def _dandiset(name: str) -> tuple[str, str]:
         layouts = [get_layout(item) for item in list_layouts()]
         return match[1], next((item.assets for item in layouts if item.dandiset == match[1]), "")
     public = [item for item in list_layouts() if get_layout(item).dandiset]
-    if name not in list_layouts():
-        raise unknown_name("data set", name, public, hint="Or give the six digits of a dandiset, such as 000231.")
+    check_name("data set", name, public, hint="Or give the six digits of a dandiset, such as 000231.")
     layout = get_layout(name)
-    if not layout.dandiset:
-        raise UsageError(f"The layout {name!r} names no data set of the DANDI archive; public are {', '.join(public)}.")
     return layout.dandiset, layout.assets

@@ -343,8 +343,6 @@ def wrench_features(stimuli: xr.Dataset) -> NDArray[np.float64]:
         )
     # Root mean square of each channel: divided by it, forces (N) and moments (N·m) are comparable.
     scale = np.sqrt(np.mean(wrench[:, :, tracked] ** 2, axis=(0, 1, 2)))
-    if not np.any(scale > 0):
-        raise DataError("The stimuli exert no force on the whiskers, so there is nothing for neurons to encode.")
     # An afferent answers to one direction of a channel (half-wave rectification) and saturates as x/(x + 1).
     signal = wrench / np.where(scale > 0, scale, np.inf)
     halves = np.concatenate([np.maximum(signal, 0.0), np.maximum(-signal, 0.0)], axis=3)

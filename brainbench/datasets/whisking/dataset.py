@@ -145,8 +145,6 @@ def read_manifest(folder: Path) -> Mapping[str, Any]:
 
 def open_shard(path: Path, entry: Mapping[str, Any], manifest: Mapping[str, Any]) -> Shard:
     """Read what stands beside the forces of a shard that the manifest names."""
-    if not path.is_file():
-        raise DataFileNotFoundError(f"The shard {str(path)!r} of the manifest is missing. {_AGAIN}")
     with open_hdf5(path, "shard", _AGAIN) as opened:
         file: Any = opened
         wrench = file["wrench"]
