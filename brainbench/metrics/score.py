@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from brainbench.core.errors import UsageError, check_name, check_once
+from brainbench.core.errors import check_name, check_once
 from brainbench.core.provenance import Provenance, UniquePart
 from brainbench.core.records import LayerScore, Score, Status, SubjectScore
 from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, t_interval, two_factor_interval
@@ -275,8 +275,6 @@ def score_agreement(
     made of each animal, ``stimuli`` the names of the K stimuli. Returns a score without layers; undefined for fewer
     than two usable animals.
     """
-    if not subjects:
-        raise UsageError("There are no animals to compare; give at least two SubjectRDM.")
     count = len(stimuli)
     animals = evaluation.gather(metric, subjects, count, estimator=estimator)
     compared = animals.scored if count >= metric.fewest and len(animals.scored) > 1 else ()

@@ -477,7 +477,7 @@ def test_unreliable_animals_alone_are_scored_as_unreliable():
 
 
 def test_an_agreement_refuses_what_it_cannot_take():
-    with pytest.raises(UsageError, match="at least two SubjectRDM"):
+    with pytest.raises(UsageError, match="give at least one SubjectRDM"):
         score_animals([])
     with pytest.raises(UsageError, match="6 stimuli; 2 are scored"):
         score_animals(_make_agreeing_animals(2), stimuli=["a", "b"])

@@ -12,7 +12,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.core.plugins import load_entry_points, load_object, load_optional
 from brainbench.core.records import Score
 from brainbench.metrics.hooks import MetricHooks
@@ -89,8 +89,7 @@ def get_metric(name: str | Metric) -> Metric:
     if ":" not in name:
         if name not in _METRICS and (target := load_optional(ENTRY_POINTS, name, "metric")) is not None:
             _enter(name, target)
-        if name not in _METRICS:
-            raise unknown_name("metric", name, list_metrics(), hint="Your own: FILE.py:CLASS.")
+        check_name("metric", name, list_metrics(), hint="Your own: FILE.py:CLASS.")
         return _METRICS[name]
     metric = _instance(load_object(name, "metric"))
     if metric.name in _METRICS and metric is not _METRICS[metric.name]:  # a record could not tell the two apart

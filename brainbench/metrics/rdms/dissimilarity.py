@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.core.errors import DataError, UsageError, check_name
+from brainbench.core.errors import DataError, UsageError, check_name, check_number
 from brainbench.metrics.arrays import (
     Array,
     Floats,
@@ -445,8 +445,7 @@ def rdm(
     else:
         matrix, codes, names = labelled_trials(responses, labels)
         count = len(names)
-    if count < 2:
-        raise UsageError(f"An RDM compares at least 2 stimuli; received {count}.")
+    check_number("The number of stimuli of an RDM", count, least=2, whole=True)
     with np.errstate(invalid="ignore", over="ignore"):
         return fetch(_METHODS[method](_Responses(matrix, count, codes, folds, precision, where)))
 
@@ -474,8 +473,7 @@ def _crossnobis(given: _Responses) -> Array:
     if folds.shape != given.codes.shape:
         raise UsageError(f"There are {len(given.codes)} trials but folds of shape {folds.shape}; give one per trial.")
     names = np.unique(folds)
-    if len(names) < 2:
-        raise UsageError(f"method='crossnobis' compares at least 2 folds; received {len(names)}.")
+    check_number("The number of folds of method='crossnobis'", len(names), least=2, whole=True)
     units, count, number = given.responses.shape[1], given.count, len(names)
     # Fold and stimulus together number the cells, so one pass over the trials averages all of them.
     flat = given.means(np.searchsorted(names, folds) * count + given.codes, number * count)

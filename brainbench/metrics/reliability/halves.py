@@ -19,7 +19,7 @@ from itertools import combinations, pairwise
 import numpy as np
 
 from brainbench.core.contracts import Trials
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import check_number
 from brainbench.metrics.arrays import Floats, Ints, finite_mean
 from brainbench.metrics.rdms import dissimilarity
 from brainbench.metrics.rdms.comparison import features, upper
@@ -299,8 +299,7 @@ def unit_reliability(blocks: Sequence[Trials], n_stimuli: int, *, seed: int = 0)
     Responses are [R, F] or [R, T, F], whose time is averaged. A unit without variation over stimuli, or with fewer than
     two trials of some stimulus in every split, has no reliability. Values can be negative.
     """
-    if n_stimuli < 3:
-        raise UsageError(f"A unit's tuning needs at least 3 stimuli; received {n_stimuli}.")
+    check_number("The number of stimuli of a unit's tuning", n_stimuli, least=3, whole=True)
     reliabilities = []
     for block in blocks:
         values = np.asarray(block.responses)

@@ -202,7 +202,7 @@ def test_the_order_of_trials_units_and_stimuli_is_irrelevant(seed, method):
         ({"labels": [0, 1]}, "3 trials but 2 labels"),
         ({"labels": [0.5, 1, 2]}, "Labels must be integers from 0 or strings"),
         ({"labels": [-1, 0, 1]}, "run from 0"),
-        ({"labels": [0, 0, 0]}, "at least 2 stimuli"),
+        ({"labels": [0, 0, 0]}, "number of stimuli of an RDM .*at least 2; received 1"),
     ],
 )
 def test_misuse_is_told_in_a_sentence(arguments, message):

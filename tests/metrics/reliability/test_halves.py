@@ -246,7 +246,7 @@ def test_the_order_of_trials_and_units_is_irrelevant():
 
 
 def test_misuse_of_units_is_told_in_a_sentence():
-    with pytest.raises(UsageError, match="at least 3 stimuli"):
+    with pytest.raises(UsageError, match="at least 3; received 2"):
         unit_reliability([_make_units()], 2)
 
 
