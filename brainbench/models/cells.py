@@ -47,8 +47,8 @@ class Cell(nn.Module):
     def __init__(self, in_channels: int, out_channels: int) -> None:
         super().__init__()
         name = type(self).__name__
-        if in_channels < 1 or out_channels < 1:
-            raise UsageError(f"{name} needs channels ≥ 1; received {in_channels} and {out_channels}.")
+        for channels in (in_channels, out_channels):
+            check_number(f"channels of {name}", channels, least=1, whole=True)
         if self.keeps_channels and in_channels != out_channels:
             raise UsageError(
                 f"{name} mixes its input into its output, so both need the same channels; received {in_channels} in "

@@ -460,9 +460,8 @@ class MambaAttender(nn.Module):
         super().__init__()
         sizes = {"expansion": expansion, "states": states, "convolution": convolution}
         given = {"features": features, "blocks": blocks, **sizes}
-        if min(given.values()) < 1:
-            received = ", ".join(f"{name} {value}" for name, value in given.items())
-            raise UsageError(f"A Mamba attender needs positive sizes; received {received}.")
+        for name, value in given.items():
+            check_number(f"{name} of a Mamba attender", value, least=1, whole=True)
         self.features = features
         self.blocks: Any = nn.ModuleList(MambaBlock(features, depth=blocks, **sizes) for _ in range(blocks))
         self.norm = nn.LayerNorm(features)

@@ -23,7 +23,14 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, brief, check_name, unknown_name
+from brainbench.core.errors import (
+    DataError,
+    DataFileNotFoundError,
+    UsageError,
+    check_kind,
+    check_name,
+    unknown_name,
+)
 from brainbench.core.files import (
     CONFIG_VARIABLE,
     check_folder,
@@ -316,8 +323,7 @@ class LocatedModel:
 
 def locate_model(name: str, pretrained: str | os.PathLike[str] | None = None) -> LocatedModel:
     """Find what a name stands for, without building anything; arguments and errors are those of :func:`load_model`."""
-    if not isinstance(name, str):
-        raise UsageError(f"A model's name is a text; received {brief(name)}.")
+    check_kind("name of a model", name, str, "a text")
     is_path = name.startswith(PREFIXES)
     if is_path and pretrained is not None:
         raise UsageError(f"{name!r} already names trained weights; pretrained is for registry names with a tag.")

@@ -211,7 +211,7 @@ def test_wrong_parameters_are_named():
             "same channels; received 3 in and 4 out",
         ),
         (lambda: IntersectionRNN(3, 4, kernel_size=2), "same channels; received 3 in and 4 out"),
-        (lambda: UGRNN(0, 3, kernel_size=2), "needs channels ≥ 1"),
+        (lambda: UGRNN(0, 3, kernel_size=2), "channels of UGRNN must be a whole number, at least 1; received 0"),
         (lambda: UGRNN(3, 3, kernel_size=2)(torch.zeros(1, 4, 5, 7)), r"expects \[batch, 3, rows, columns\]"),
         (
             lambda: LSTM(3, 3, kernel_size=2)(torch.zeros(1, 3, 5, 7), torch.zeros(1, 3, 5, 7)),

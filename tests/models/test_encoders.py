@@ -307,7 +307,7 @@ def test_activations_are_the_blocks_and_the_norm():
 
 
 def test_sizes_are_positive():
-    with pytest.raises(UsageError, match="features 12, blocks 0"):
+    with pytest.raises(UsageError, match=r"blocks of a Mamba attender .*received 0"):
         MambaAttender(12, blocks=0)
 
 

@@ -312,8 +312,6 @@ class TemporalGraph(nn.Module):
         Equals :meth:`forward` step by step.
         """
         check_name("unrolling", unroll, UNROLLS)
-        if x.ndim != 4:
-            raise UsageError(f"A step expects [batch, channels, rows, columns]; received {list(x.shape)}.")
         self._accept(tuple(x.shape[1:]))
         outputs: dict[str, torch.Tensor] = {}
         memories: dict[str, torch.Tensor] = {}

@@ -96,12 +96,10 @@ def _graph(source: Mapping[str, Any]) -> GraphSpec:
         edge = _Section(entry, "an edge")
         ends.append((str(edge.take("from")), str(edge.take("to"))))
         edge.done()
-    inputs, output = tuple(config.take("input_nodes")), config.take("output_node")
+    inputs, output = tuple(config.take("input_nodes")), config.take("output_node", kind=str)
     shape, order = tuple(config.take("input_shape", kind=tuple[_Size, ...])), config.take("ff_order", None)
     # The number of steps is that of the stimulus; the decoder stands beside the graph.
     config.done("num_timesteps", "sep_num", "addnet")
-    if not isinstance(output, str):
-        raise DataError(f"The graph configuration names the output nodes {output!r}; exactly one is supported.")
     names = [node.name for node in nodes]
     if order is not None and sorted(order) != sorted(names):
         raise DataError(f"'ff_order' {order!r} must list every node once: {names!r}.")

@@ -19,7 +19,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from brainbench.core.errors import DataError, UsageError, check_name, check_number, listing, nearest, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_name, check_number, listing, nearest
 from brainbench.core.files import content_hash
 
 
@@ -130,8 +130,7 @@ def activation(name: str | None) -> nn.Module:
     """Build an activation by name (:data:`ACTIVATIONS`, any case); None is the identity."""
     if name is None:
         return nn.Identity()
-    if name.lower() not in ACTIVATIONS:
-        raise unknown_name("activation", name, ACTIVATIONS)
+    check_name("activation", name.lower(), ACTIVATIONS)
     return ACTIVATIONS[name.lower()]()
 
 

@@ -114,8 +114,6 @@ def find_folder(source: str) -> Path:
     """
     if source.startswith(LOCAL):
         folder = user_path(source.removeprefix(LOCAL))
-        if not folder.is_dir():
-            raise DataFileNotFoundError(f"There is no folder {os.fspath(folder)!r}.")
         return _imported(folder, source)
     place, _, revision = source.removeprefix(HUB).partition("@")
     owner, name, *inner = place.split("/") if "/" in place else ("", "")

@@ -21,7 +21,7 @@ import msgspec
 import torch
 from torch import nn
 
-from brainbench.core.errors import DataError, UsageError
+from brainbench.core.errors import DataError, UsageError, check_kind
 from brainbench.core.files import read_mapping, write_json, write_tensors
 from brainbench.core.progress import Progress
 from brainbench.core.reading.regular import readable
@@ -110,10 +110,7 @@ def train(
         How it ended. A loss or gradient that is not finite ends it as ``diverged``: the last good state and model
         stay, and the batch is kept in ``failed-batch.safetensors``.
     """
-    if not isinstance(data, Data):
-        raise UsageError(
-            f"Data for training have classes, a summary and batches(split, options); received {type(data).__name__}."
-        )
+    check_kind("data of a training", data, Data, "an object with classes, a summary and batches(split, options)")
     stop = folder.Stop(stop_after)
     with processes(device) as where, folder.occupied(Path(out), stop, lock=where.first), seeded(config.seed):
         run = _Run(config, data, Path(out), where, progress, Path(controls or out) / CONTROLS_FILE)

@@ -268,7 +268,7 @@ def test_a_sweep_without_time_is_refused(shape):
 
 def test_a_step_with_time_is_refused():
     graph = _small()
-    with pytest.raises(UsageError, match=r"\[batch, channels, rows"):
+    with pytest.raises(UsageError, match=r"steps of shape \[channels, rows, columns\]"):
         graph.step(torch.zeros(1, 1, 30, 5, 7), graph.init_state(1))
 
 

@@ -171,7 +171,7 @@ def test_edges_of_another_kind_are_refused(edges):
 
 
 def test_several_outputs_are_refused():
-    with pytest.raises(DataError, match=r"\['a', 'b'\]; .*one"):
+    with pytest.raises(UsageError, match=r"'output_node' .*must be a text; received \['a', 'b'\]"):
         read_graph(_config(output_node=["a", "b"]))
 
 

@@ -518,7 +518,7 @@ def test_data_that_cannot_be_trained_on_end_in_a_sentence_and_leave_no_folder(tm
 
 
 def test_what_is_no_data_set_is_named(tmp_path):
-    with pytest.raises(UsageError, match=r"classes, a summary and batches.*received list"):
+    with pytest.raises(UsageError, match=r"classes, a summary and batches.*received \[1, 2\]"):
         train(_config(), [1, 2], out=tmp_path / "run", device="cpu")
 
 
