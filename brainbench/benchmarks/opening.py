@@ -8,7 +8,6 @@ import math
 import os
 import re
 import shutil
-import stat
 import unicodedata
 import zipfile
 from collections import Counter
@@ -24,6 +23,7 @@ from brainbench.core.errors import (
     UsageError,
     brief,
     check_each,
+    check_name,
     listing,
     nearest,
     unknown_name,
@@ -291,8 +291,6 @@ def _unpacked(path: Path) -> tuple[Benchmark, Path]:
 def _definition(archive: zipfile.ZipFile, where: str) -> Benchmark:
     """Return the definition in an archive, whose members are the files that it lists and no others."""
     members = {entry.filename: entry for entry in archive.infolist()}
-    if links := [name for name, entry in members.items() if stat.S_ISLNK(entry.external_attr >> 16)]:
-        raise DataError(f"{where} holds a link, {brief(links[0])}; it holds files alone: pack it again.")
     if DEFINITION not in members:
         guess = next((name for name in members if name.endswith(DEFINITION)), None) or nearest(DEFINITION, members)
         near = f"; its {brief(guess)} stands elsewhere or is called otherwise" if guess else ""
@@ -446,14 +444,13 @@ def options_of(benchmark: Benchmark, folder: Path) -> ScoreOptions:
     """Return the options that a benchmark states, with its files where they are."""
     stated: dict[str, Any] = dict(benchmark.options)
     layout, colon, path = benchmark.recordings.path.rpartition(":")
-    if colon and layout not in list_layouts():
-        raise unknown_name("recording layout of a benchmark", layout, list_layouts())
+    if colon:
+        check_name("recording layout of a benchmark", layout, list_layouts())
     recordings = path if path in DEMOS else f"{layout}{colon}{folder / path}"
     if path not in DEMOS:
         _check_listed(benchmark, folder, path, find_files(folder / path))
     if (stimuli := stated.get("stimuli")) is not None and not is_recipe(str(stimuli)):
-        if stimuli not in benchmark.files:
-            raise unknown_name("stimuli of a benchmark", stimuli, [*benchmark.files, *list_recipes()])
+        check_name("stimuli of a benchmark", stimuli, [*benchmark.files, *list_recipes()])
         scene = folder / str(stimuli)
         if scene.suffix == ".toml":
             _check_listed(benchmark, folder, str(stimuli), files_named_in(scene, read_toml(scene)))

@@ -405,13 +405,7 @@ def report_file(path: Path | None) -> Path | None:
     from leaderboards.report.paper import FORMATS
 
     kind = path.suffix.removeprefix(".").lower()
-    if not kind:
-        allowed = ", ".join(f".{name}" for name in FORMATS)
-        raise UsageError(
-            f"--report names {brief(str(path))}, which has no ending; give a file that ends in one of {allowed}, or "
-            "leave --report out for no report."
-        )
-    check_name("report format", kind, FORMATS, hint="The ending of --report chooses it.")
+    check_name("report format", kind or path.name, FORMATS, hint="The ending of --report chooses it.")
     if kind == "pdf" and find_spec("weasyprint") is None:
         raise missing_dependency("weasyprint", extra="board", purpose="A report as PDF")
     return _file(path, "--report")

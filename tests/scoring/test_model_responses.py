@@ -105,7 +105,7 @@ def test_a_lazy_layer_without_weights_is_named():
 
 
 def test_a_prefix_of_trained_weights_is_never_code():
-    with pytest.raises(DataFileNotFoundError, match=r"There is no folder 'mine\.py'"):
+    with pytest.raises(DataFileNotFoundError, match=r"There is no config.json in 'mine\.py'"):
         resolve_model("local-dir:mine.py")
 
 

@@ -174,8 +174,6 @@ def add(
         raise UsageError("Options of the scores stand in the batch file itself, under [options].")
     if not model and (idle := [*options, *(["seed"] if seeds else [])]):
         raise UsageError(f"Only models of --model are scored with --{idle[0]}; name one, or leave the option out.")
-    if to.exists() and not to.is_dir():
-        raise UsageError(f"--to is a folder; {str(to)!r} is a file.")
     jobs = []
     if model:
         jobs += jobs_of(model, parse_seeds(seeds) if seeds else None, options)

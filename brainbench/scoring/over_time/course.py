@@ -31,7 +31,6 @@ from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, two_facto
 from brainbench.metrics.arrays import Floats, Ints, finite_mean
 from brainbench.metrics.evaluation import choose_on_others, most_chosen
 from brainbench.metrics.inference.permutation import canonical_order, label_orders, tail_p
-from brainbench.metrics.measures.rsa import RSA
 from brainbench.metrics.rdms.comparison import (
     check_comparison,
     compare_all,
@@ -507,9 +506,8 @@ def time_course(inputs: ScoreInputs, *, progress: Progress | None = None) -> Tim
     long as the window of most trials (the median). Recordings have bins of one width.
     """
     brain, network, options = inputs.brain, inputs.network, inputs.options
-    metric, labels = inputs.metric, inputs.labels
-    if not isinstance(metric, RSA):
-        raise UsageError(f"Scores over time compare RDMs; the metric {metric.name!r} has none.")
+    metric: Any = inputs.metric  # of RDMs, as was checked before anything was read
+    labels = inputs.labels
     if "time" not in brain.dataset.coords or brain.dataset.sizes["time"] < 3:
         raise DataError(
             "Scores over time need recordings in at least 3 bins of time; give a smaller bin (--bin, seconds) or a "

@@ -74,8 +74,7 @@ def signal_dimensions(animals: Iterable[Sequence[Trials]], n_stimuli: int, *, se
     within an animal and 1/D_two = a²/D between two, which are solved for D. ``animals`` are the sessions of each
     animal, responses [R, U] or [R, T, U], whose time is averaged.
     """
-    if n_stimuli < 3:
-        raise UsageError(f"Dimensions are estimated from at least 3 stimuli; received {n_stimuli}.")
+    check_number("The number of stimuli of dimensions", n_stimuli, least=3, whole=True)
     within, products = np.zeros(2), []
     for index, blocks in enumerate(animals):
         whole = np.zeros((n_stimuli, n_stimuli))

@@ -22,7 +22,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import UsageError, brief, check_number, listing, repeats, unknown_name
+from brainbench.core.errors import UsageError, brief, check_name, check_number, listing, repeats
 from brainbench.core.figures import INK, PALE, check_format, new_figure, save_figure
 from brainbench.core.files import content_hash, read_json, to_plain, write_json
 from brainbench.core.limits import Count, Limit, Seed, limited
@@ -270,10 +270,9 @@ class Candidate:
     def choose(self, layer: str, random: np.random.Generator) -> str:
         """Return the layer that ``any``, ``last`` or a name means."""
         names = list(self.features)
+        check_name(f"layer of {self.name}", layer, ["any", "last", *names])
         if layer in names:
             return layer
-        if layer not in ("any", "last"):
-            raise unknown_name(f"layer of {self.name}", layer, ["any", "last", *names])
         return names[-1] if layer == "last" else names[int(random.integers(len(names)))]
 
     def geometry(self, layer: str, rows: NDArray[np.int64]) -> ResponseGeometry:

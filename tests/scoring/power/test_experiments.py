@@ -291,7 +291,7 @@ def test_equal_distances_have_the_most_dimensions():
 
 def test_what_cannot_be_estimated_is_said():
     rng = np.random.default_rng(5)
-    with pytest.raises(UsageError, match="at least 3 stimuli; received 2"):
+    with pytest.raises(UsageError, match="at least 3; received 2"):
         signal_dimensions(_animals(rng, 2, 2), 2)
     with pytest.raises(UsageError, match=r"received shape \(4,\)"):
         pattern_dimensions(np.ones(4))
