@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.contracts import CHANNELS, check_stimulus_set
-from brainbench.core.errors import DataError, UsageError, check_name, choose_name, listing, needing
+from brainbench.core.errors import DataError, UsageError, check_name, check_number, choose_name, listing, needing
 from brainbench.core.figures import DOTS_PER_INCH, INK, PALE, check_format, new_figure, save_figure
 from brainbench.core.files import atomic_path
 from brainbench.core.limits import Limit, Positive, Share, limited
@@ -474,8 +474,7 @@ def film_times(scene: Scene, start: float = 0.0, stop: float | None = None, step
             f"in steps of {step:g} s."
         )
     count = int((stop - start) / step + 1e-6) + 1
-    if count > 10_000:
-        raise UsageError(f"A film of {count:,} frames is refused (at most 10,000); choose longer steps.")
+    check_number("The number of frames of a film, which longer steps make fewer,", count, most=10_000)
     return [start + step * index for index in range(count)]
 
 

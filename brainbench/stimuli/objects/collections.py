@@ -18,7 +18,16 @@ from pathlib import Path
 
 import numpy as np
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, brief, listing, repeats, unknown_name
+from brainbench.core.errors import (
+    DataError,
+    DataFileNotFoundError,
+    UsageError,
+    brief,
+    check_number,
+    listing,
+    repeats,
+    unknown_name,
+)
 from brainbench.core.files import file_hash
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.tables import read_rows
@@ -276,6 +285,5 @@ def _files(pattern: str, unit: str | None, collision: str) -> Iterator[NamedObje
 def _shapenet(text: str, collision: str) -> Iterator[NamedObject]:
     folder, _, number = text.rpartition(":") if re.search(r":\d+$", text) else (text, "", "")
     models = load_shapenet(Path(folder).absolute(), collision=collision).values()
-    if number and int(number) > len(models):
-        raise UsageError(f"{folder!r} has {len(models)} models, fewer than the {number} asked for.")
+    check_number(f"The number of models of {folder!r}", int(number or 0), most=len(models), whole=True)
     yield from itertools.islice(models, int(number) if number else None)

@@ -10,7 +10,7 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -148,6 +148,5 @@ def _scene_files() -> dict[str, Traversable]:
 def recipe_file(name: str) -> Traversable:
     """Return the scene file of a packaged recipe."""
     files = _scene_files()
-    if name not in files:
-        raise unknown_name("stimulus recipe", name, list_recipes())
+    check_name("stimulus recipe", name, list_recipes())
     return files[name]

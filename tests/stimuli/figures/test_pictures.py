@@ -320,7 +320,7 @@ def test_one_stimulus_and_a_part_of_the_time_can_be_chosen(few, tmp_path):
         ({"channel": "Gx"}, "Unknown channel 'Gx'"),
         ({"stimulus": "on"}, "did you mean 'one'"),
         ({"out": "a.jpg"}, "Allowed: '.png', '.svg', '.pdf'"),
-        ({"out": "a"}, "has no ending"),
+        ({"out": "a"}, "format of a picture .a.\\. Allowed"),
     ],
 )
 def test_wrong_requests_are_refused_in_words(dataset, tmp_path, options, message):
