@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from brainbench.core.devices import pick_device, record_launches, warp
-from brainbench.core.errors import UsageError, check_kind, check_number, listing, unknown_name
+from brainbench.core.errors import UsageError, check_kind, check_name, check_number, listing
 from brainbench.core.plugins import load_object
 from brainbench.core.rotations import to_matrices
 from robotics_bridge.physics.scene import TouchScene
@@ -170,10 +170,7 @@ class SensorSuite:
         self.num_envs, self.device = num_envs, pick_device(device)
         groups: dict[Any, dict[str, Sensor]] = {}
         for name, sensor in sensors.items():
-            if not isinstance(sensor, Sensor):
-                raise UsageError(
-                    f"{name!r} must be a sensor such as ContactProbe(...); received {type(sensor).__name__}."
-                )
+            check_kind(f"sensor {name!r}", sensor, Sensor, "ContactProbe(...) or another one")
             scene.link_index(sensor.link)
             self.sensors[name] = sensor = sensor.for_scene(scene)
             groups.setdefault((type(sensor), sensor.group()), {})[name] = sensor
@@ -414,8 +411,7 @@ class SensorSuite:
     def runtime_of(self, name: str, kind: type[Sensor] = Sensor, what: str = "sensor") -> Runtime:
         """Return the runtime of a sensor of a kind, which messages call ``what``."""
         choices = tuple(key for key, sensor in self.sensors.items() if isinstance(sensor, kind))
-        if name not in choices:
-            raise unknown_name(what, name, choices)
+        check_name(what, name, choices)
         return self._owner[name]
 
     def _view(self, name: str, planes: Any) -> torch.Tensor:

@@ -116,8 +116,7 @@ def bounded(task: Task) -> Task:
 
 def forget(name: str) -> None:
     """Remove a task that was registered; raise UsageError for any other, since tasks of the package stay."""
-    if name not in _MADE or name in _SHIPPED:
-        raise unknown_name("task of yours", name, [n for n in _MADE if n not in _SHIPPED])
+    check_name("task of yours", name, [n for n in _MADE if n not in _SHIPPED])
     del _MADE[name]
 
 
@@ -130,9 +129,8 @@ def load(name: str, config: str = "default") -> Task:
     """Return a task in one of its configurations (``default``, ``published``, …)."""
     if name in _SHIPPED:
         import_module(f"robotics_bridge.tasks.{_SHIPPED[name]}")
-    if name not in _MADE:
-        hint = "A task of your own: import its file first (brainbench policy: --task-file FILE)."
-        raise unknown_name("task", name, list_tasks(), hint=hint)
+    hint = "A task of your own: import its file first (brainbench policy: --task-file FILE)."
+    check_name("task", name, list_tasks(), hint=hint)
     check_name(f"configuration of task {name}", config, _MADE[name])
     with foreign_code(f"The task {name!r}"):
         task = _MADE[name][config]()

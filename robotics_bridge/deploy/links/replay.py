@@ -31,6 +31,7 @@ from brainbench.core.errors import (
     DataError,
     UsageError,
     brief,
+    check_number,
     listing,
     missing_dependency,
     unknown_name,
@@ -448,8 +449,7 @@ def _read_episode(folder: Path, hand: Hand, layout: Layout, episode: int) -> Tou
     if version[:2] not in ("v2", "v3"):
         raise DataError(f"{name} is no LeRobot data set of layout v2 or v3; its codebase_version is {version!r}.")
     features, episodes = info.get("features", {}), info.get("total_episodes", 0)
-    if not 0 <= episode < episodes:
-        raise UsageError(f"{name} has {episodes} episodes, from 0; received {episode}.")
+    check_number(f"The number of an episode of {name}", episode, least=0, below=episodes, whole=True)
     if absent := {"observation.state", "observation.tactile"} - set(features):
         raise DataError(f"{name} lacks {listing(sorted(absent))}: joints and touch are what is replayed.")
     frames = _frames(folder, version, episode, info)

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from brainbench.core.errors import UsageError, check_each, check_once
+from brainbench.core.errors import UsageError, check_each, check_number, check_once
 from brainbench.core.limits import Count, Limit, limited
 from brainbench.core.progress import Progress
 from robotics_bridge.envs.env import Env
@@ -251,8 +251,7 @@ def _blocks(gram: torch.Tensor, taxels: int, width: int) -> torch.Tensor:
 
 def check_count(layout: Mapping[str, Probes], count: int) -> None:
     """Raise UsageError unless so many taxels can be chosen of a layout."""
-    if not 1 <= count <= (total := active_count(layout)):
-        raise UsageError(f"Between 1 and {total} taxels can be chosen of this hand; received {count}.")
+    check_number("The number of taxels to choose of this hand", count, least=1, most=active_count(layout), whole=True)
 
 
 def even_taxels(layout: Mapping[str, Probes], count: int) -> list[int]:
@@ -374,8 +373,7 @@ class ProbeOptions:
 def check_environments(env: Env, parts: int = 1) -> int:
     """Return the fewest environments of a probe in so many parts; raise UsageError if there are fewer."""
     least = 2 * FOLDS * parts
-    if env.num_envs < least:
-        raise UsageError(f"A probe needs at least {least} environments; received {env.num_envs}.")
+    check_number("The number of environments of a probe", env.num_envs, least=least, whole=True)
     return least
 
 

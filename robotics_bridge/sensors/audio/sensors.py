@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from typing import Annotated, ClassVar
 
-from brainbench.core.errors import UsageError, check_number, unknown_name
+from brainbench.core.errors import UsageError, check_name, check_number
 from brainbench.core.limits import Count, Limit, NotNegative, Positive, limited
 from robotics_bridge.sensors.sensor import Sensor
 
@@ -52,8 +52,7 @@ def elastic_material(name: str | ElasticMaterial) -> ElasticMaterial:
     if isinstance(name, ElasticMaterial):
         return name
     chosen = "steel" if name == "metal" else name
-    if chosen not in ELASTIC_MATERIALS:
-        raise unknown_name("elastic material", name, ELASTIC_MATERIALS)
+    check_name("elastic material", chosen, ELASTIC_MATERIALS)
     return ELASTIC_MATERIALS[chosen]
 
 

@@ -241,7 +241,7 @@ def test_seeds_and_offsets_decide_the_noise_and_nothing_else() -> None:
     ("make", "message"),
     [
         (lambda: suite_of({"a": ContactProbe(link="hnad", probes=GRID)}), "did you mean 'hand'"),
-        (lambda: suite_of({"a": GRID}), "must be a sensor"),
+        (lambda: suite_of({"a": GRID}), "The sensor .a. must be ContactProbe"),
         (lambda: suite_of({}, envs=0), "at most 1,000,000; received"),
         (
             lambda: ContactProbe(link="hand", probes=GRID, threshold=1e-4, release=2e-4),

@@ -304,7 +304,7 @@ def test_episodes_of_both_layouts_and_tables_are_read_alike(recorded, jaws, tmp_
         for name in ("time", "position", "force"):
             np.testing.assert_allclose(getattr(read, name), getattr(log, name), atol=1e-6)
         np.testing.assert_allclose(read.points.position, log.points.position)
-    with pytest.raises(UsageError, match="1 episodes"):
+    with pytest.raises(UsageError, match="below 1; received 1"):
         read_touch_log(folder, hand, layout, 1)
 
 

@@ -239,10 +239,10 @@ def test_a_hand_is_placed_from_one_rollout(tmp_path) -> None:
     assert rows["random"]["draws"] == 2
     assert {one["arm"] for one in told["differences"]} == set(rows) - {"all"}
     assert active_count(layout) == 4
-    with pytest.raises(UsageError, match="Between 1 and 90 taxels"):
+    with pytest.raises(UsageError, match=r"taxels .*at least 1 and at most 90; received 91"):
         place(env, agent("random", env), ProbeOptions(seconds=0.5, place=91))
     small = tasks.make("in_palm_rotate", num_envs=10, observe="force_torque", resolution="low", threads=1)
-    with pytest.raises(UsageError, match="at least 20 environments; received 10"):
+    with pytest.raises(UsageError, match=r"environments of a probe .*at least 20; received 10"):
         place(small, agent("random", small), ProbeOptions(seconds=0.5, place=4))
 
 
