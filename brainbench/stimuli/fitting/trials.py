@@ -94,7 +94,7 @@ class Trial:
     def __post_init__(self) -> None:
         count = self.measured.sizes["time"]
         if count < FEWEST_FRAMES:
-            raise DataError(_few(count))
+            raise DataError(f"The measurement has {count} frames; a fit over time needs at least {FEWEST_FRAMES}.")
         if "noise" in self.measured and not (self.measured["noise"].values > 0).all():
             raise DataError(
                 f"The noise of a measurement is above 0; received {self.measured['noise'].values.tolist()}."
@@ -142,8 +142,6 @@ class Trial:
         arc = 0.95 * whisker.arc_length if arc is None else arc
         check_number("The arc length (m) of the held point", arc, above=0, most=whisker.arc_length)
         times = measured["time"].values.astype(float)
-        if len(times) < FEWEST_FRAMES:
-            raise DataError(_few(len(times)))
         if times[0] < 0:
             raise UsageError(
                 f"The times of a ring-down count from the release; the first is {times[0]:g} s: cut the frames before."
@@ -192,10 +190,6 @@ class Trial:
         assert trace.link_positions is not None
         nodes = build_chain(whisker, trace.link_positions.shape[1] - 1).nodes
         return normal_offsets(nodes, trace.link_positions, self.measured["shape"].values)
-
-
-def _few(count: int) -> str:
-    return f"The measurement has {count} frames; a fit over time needs at least {FEWEST_FRAMES}."
 
 
 def check_clock(times: NDArray[np.float64], frequency: float, damping_ratio: float) -> None:
