@@ -22,6 +22,7 @@ from brainbench.core.errors import UsageError
 from brainbench.core.limits import (
     Count,
     Limit,
+    NotNegative,
     bounds_of,
     check_limits,
     check_value,
@@ -174,6 +175,39 @@ def test_every_class_with_limits_checks_them_when_it_is_made(module: str):
 
     for cls in {inner for base in _classes(module) for inner in below(base)}:
         assert getattr(cls.__post_init__, "checks_limits", False), f"{cls.__name__} checks nothing"
+
+
+@limited
+class Cell:
+    size: Count = 1
+
+
+@limited
+class Stepping:
+    step: Count = 1
+
+
+@limited(of="{} of a table")
+class Table:
+    title: str = ""
+    cells: tuple[Cell | Stepping, ...] = ()
+    weights: Mapping[str, NotNegative] = field(default_factory=dict)
+
+
+@pytest.mark.parametrize(
+    ("values", "sentence"),
+    [
+        ({"title": 3}, "The title of a table must be a text; received 3 (int)."),
+        ({"cells": (3,)}, "The cells of a table must be Cell(…) or Stepping(…); received 3 (int)."),
+        ({"weights": [1]}, "The weights of a table must be names and values; received [1] (list)."),
+        ({"weights": {"a": -1}}, "weights of a table (a) must be a finite number, at least 0; received -1."),
+    ],
+)
+def test_texts_parts_and_mappings_are_limits_too(values: dict[str, Any], sentence: str):
+    assert Table(title="a", cells=[Cell()], weights={"a": 0}).title == "a"
+    with pytest.raises(UsageError) as error:
+        Table(**values)
+    assert str(error.value) == sentence
 
 
 @limited(of="{} of a grid")
