@@ -133,7 +133,7 @@ def test_constants_have_a_size_and_a_range(values) -> None:
 
 @pytest.mark.parametrize("value", [*NOT_FINITE, 0, 1e9, "1000", None])
 def test_a_calibration_of_a_finger_has_a_range(value) -> None:
-    with pytest.raises(UsageError, match=f"'thumb' of a pressure calibration .*{value}"):
+    with pytest.raises(UsageError, match=f"thumb.*{value}"):
         PressureCalibration(per_finger={"thumb": value})
     with pytest.raises(UsageError, match="'axes' of a pressure calibration must not be 0"):
         PressureCalibration(axes=(1.0, 0.0, 1.0))
