@@ -37,6 +37,8 @@ from robotics_bridge.sensors.kernels.readout import (
     group_functions,
     load_four,
     put_push,
+    widest_across,
+    within,
 )
 
 wp = warp()
@@ -606,23 +608,19 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, mode: int, sticky: bool,
                                 spin = wp.dot(tilt, push.normal)
                                 tilt -= spin * push.normal
                                 spin = wp.clamp(spin, -mean / far, mean / far)
-                                steepest = wp.length(tilt) * far / mean
-                                if steepest > 1.0:
+                                lean = wp.cross(push.normal, tilt) * (far / mean)
+                                if wp.length(lean) > 1.0:
+                                    # Along their spread and across it by themselves: nothing bears across it what
+                                    # presses beside the outermost, which keeps its place along it.
+                                    long = widest_across(extents, push.normal)
+                                    tilt = wp.cross(within(lean, push.normal, long, 0.7), push.normal) * (mean / far)
                                     rounds += 1
                                     more = rounds < wp.static(ROUNDS)
                                     if more:
-                                        # At first more than linear, as the inverse of Langevin's function (Cohen
-                                        # 1991): weights that are even shift by less the more they lean.
-                                        lean = wp.cross(push.normal, tilt) / mean
-                                        if rounds == 1:
-                                            x2 = wp.min(wp.dot(lean, extents @ lean) / 3.0, 0.3)
-                                            lean *= (3.0 - x2) / (3.0 - 3.0 * x2)
                                         # From weights on the wrong side a whole step of Newton's leaps over the right
                                         # ones, to and fro.
-                                        lean *= wp.min(wp.static(STRIDE) / (far * wp.length(lean)), 1.0)
-                                        lean += push.lean
-                                        push.lean = lean * wp.min(wp.static(STEEPEST) / (far * wp.length(lean)), 1.0)
-                                    tilt /= steepest
+                                        lean = within(lean, push.normal, long, wp.static(STRIDE)) + far * push.lean
+                                        push.lean = within(lean, push.normal, long, wp.static(STEEPEST)) / far
                                 tilt += spin * push.normal
                                 if not more:
                                     rest[1] += whole * wp.length(moment - inertia @ tilt)

@@ -142,9 +142,7 @@ def indent_kernel(kinds: frozenset[int], raycast: bool, planes: int, in_turn: bo
                 pads.indentation[1, env, n] = noisy
             # The bulge h^α is asked for by many markers, so it is raised once.
             for plane in range(wp.static(planes)):
-                value = h
-                if plane == 1:
-                    value = noisy
+                value = wp.where(plane == 1, noisy, h)
                 raised = float(0.0)
                 if value > 0.0:
                     raised = wp.pow(value, pads.gels[part].exponent)

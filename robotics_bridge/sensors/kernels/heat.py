@@ -116,9 +116,7 @@ def collect_contacts(state: StateArrays, heat: HeatArrays):
 def other_link(pair: wp.vec2i, heat: HeatArrays, link: int) -> int:
     """Return the other link of a contact."""
     a = link_at(pair[0], heat)
-    if a == link:
-        return link_at(pair[1], heat)
-    return a
+    return wp.where(a == link, link_at(pair[1], heat), a)
 
 
 @wp.func
@@ -224,9 +222,7 @@ def conduct_contacts(measure: int, state: StateArrays, heat: HeatArrays, io: Rea
             # Contacts may list the two geometries in either order; normals are turned to one side before they are
             # averaged.
             side = state.contact_normal[d]
-            if wp.dot(side, state.contact_normal[c]) < float(0.0):
-                side = -side
-            normal = normal + side
+            normal = normal + wp.where(wp.dot(side, state.contact_normal[c]) < float(0.0), -side, side)
             spots = spots + spot_area(state.contact_distance[d], grid.contact_radius)
             deepest = wp.max(deepest, -state.contact_distance[d])
     center = center / float(points)
@@ -415,10 +411,7 @@ def sense_temperature(heat: HeatArrays, io: ReadoutArrays, fresh: wp.array2d(dty
         heat.element[env, n] = lagged
     above = float(lagged - wp.float64(grid.base_temperature))
     seen = grid.base_temperature + wp.clamp(above, -grid.cold_range, grid.warm_range)
-    true = float(t)
     # What an environment that diverged reads is marked; its field waits.
-    if (io.status[env] & 1) != 0:
-        true = wp.nan
-        seen = wp.nan
-    io.truth[0, env, n] = true
-    io.measured[0, env, n] = seen
+    lost = (io.status[env] & 1) != 0
+    io.truth[0, env, n] = wp.where(lost, wp.nan, float(t))
+    io.measured[0, env, n] = wp.where(lost, wp.nan, seen)

@@ -116,11 +116,9 @@ def probe_kernel(kinds: frozenset[int], raycast: bool, reads: str, mode: int, hy
         if wp.static(binary):
             # Each branch latches on its own last bit (4.3): noise must not switch the true contact.
             truth = latch(io.truth[0, env, n], age, truth, limits[part])
+        bit = io.measured[0, env, n]
+        emit(io, env, n, truth, signal)
         if wp.static(binary and mode != CLEAN):
-            bit = io.measured[0, env, n]
-            emit(io, env, n, truth, signal)
             io.measured[0, env, n] = latch(bit, age, io.measured[0, env, n], limits[part])
-        else:
-            emit(io, env, n, truth, signal)
 
     return read_probes

@@ -67,6 +67,23 @@ def put_push(planes: wp.array3d(dtype=wp.float32), row: int, n: int, x: wp.vec3f
     store_planes(planes, row, n, 6, value)
 
 
+@wp.func
+def widest_across(extents: wp.mat33f, normal: wp.vec3f) -> wp.vec3f:
+    """Return the unit vector across a normal along which places spread most."""
+    u = wp.cross(normal, wp.where(wp.abs(normal[0]) < 0.7, wp.vec3f(1.0, 0.0, 0.0), wp.vec3f(0.0, 1.0, 0.0)))
+    u = wp.normalize(u)
+    v = wp.cross(normal, u)
+    angle = 0.5 * wp.atan2(2.0 * wp.dot(u, extents @ v), wp.dot(u, extents @ u) - wp.dot(v, extents @ v))
+    return wp.cos(angle) * u + wp.sin(angle) * v
+
+
+@wp.func
+def within(x: wp.vec3f, normal: wp.vec3f, long: wp.vec3f, most: float) -> wp.vec3f:
+    """Return a vector across a normal whose parts along an axis and across it are at most so long."""
+    wide = wp.cross(normal, long)
+    return wp.clamp(wp.dot(x, long), -most, most) * long + wp.clamp(wp.dot(x, wide), -most, most) * wide
+
+
 @cache
 def group_functions(lanes: int) -> SimpleNamespace:
     """Return functions of so many threads of a GPU, a power of 2 up to 32.

@@ -12,7 +12,7 @@ from robotics_bridge import hands
 from robotics_bridge.envs.kernels.actuation import add_contact_forces
 from robotics_bridge.hands.observations import observe
 from robotics_bridge.hands.scenes import closing, holding
-from robotics_bridge.physics import HandState, MujocoEngine, TouchScene
+from robotics_bridge.physics import Geometry, HandState, MujocoEngine, TouchScene
 from robotics_bridge.sensors import (
     ContactAudio,
     ContactProbe,
@@ -25,7 +25,7 @@ from robotics_bridge.sensors import (
 from robotics_bridge.sensors.audio.sensors import Modes
 from robotics_bridge.sensors.temperature.grid import ThermalBody
 from tests.factories.touch_scenes import PAD as PAD_OF_HAND
-from tests.factories.touch_scenes import require_processor
+from tests.factories.touch_scenes import pad_scene, poses_at, require_processor, state_of, suite_of
 
 mujoco = pytest.importorskip("mujoco")
 wp = warp()
@@ -177,6 +177,29 @@ def test_two_taxels_take_the_whole_of_a_load_whose_moment_they_cannot_bear(caplo
         assert suite.unbalanced.tolist() == [flagged]
         messages = [record.getMessage() for record in caplog.records]
         assert ["on link 'pad' are shown by no taxel" in message for message in messages] == [True] * flagged
+
+
+@pytest.mark.parametrize("rows", [1, 2, 5])
+def test_a_load_beside_the_taxels_lies_at_the_nearest_place_that_they_can_show(rows: int) -> None:
+    """Pushes have their centre within the outline of the taxels: what a load beside it lacks is its way there alone."""
+    half = 0.002 * np.array([4, rows - 1])  # m, along and across
+    probes = Probes.grid(rows, 5, size=(2 * half[1], 2 * half[0]), center=(0, 0, 0.01), radius=0.004)
+    rng = np.random.default_rng(rows)
+    loads = np.concatenate([rng.uniform(-1, 1, (40, 2)) * (half + 0.0025), half * [[0.5, 1], [0.9, 1]]])
+    envs, up, scene = len(loads), [0, 0, 1.0], pad_scene(Geometry(name="a", link="object", kind="box", size=(0.2,) * 3))
+    state = state_of(scene, poses_at(3, {1: (0, 0, -0.005), 2: (0, 0, 0.204)}, envs), touch=False)
+    points = np.c_[loads, np.full(envs, 0.005)]
+    state.set_contacts(range(envs), [[0, 1]] * envs, distance=[-1e-3] * envs, position=points, normal=[up] * envs,
+                       force=[1.0] * envs)  # fmt: skip
+    suite = suite_of({"t": KinematicTaxel(link="hand", probes=probes, total="engine")}, envs, scene)
+    suite.update(state)
+    pushes = -suite.read("t")[..., 2].reshape(envs, -1).numpy()
+    center = pushes @ probes.position[:, :2] / pushes.sum(axis=1, keepdims=True)
+    nearest = np.clip(loads, -half, half)
+    np.testing.assert_allclose(pushes.sum(axis=1), 1, atol=1e-4)
+    np.testing.assert_allclose(center, nearest, atol=5e-5)
+    lacks = np.linalg.norm(loads - nearest, axis=1)
+    np.testing.assert_allclose(suite.missing_moment[:, 1], lacks, atol=5e-5)
 
 
 def test_the_side_of_a_block_is_not_pushed_by_its_bottom() -> None:
