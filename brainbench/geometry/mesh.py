@@ -587,13 +587,14 @@ def point_triangle_distance(points: NDArray[np.float64], triangles: NDArray[np.f
     size[size == 0] = 1.0
     origin, scale = triangles[:, :1], size[:, None]
     there, corners = (points - origin[:, 0]) / scale, (triangles - origin) / scale[:, None]
-    distance = np.linalg.norm(there - trimesh.triangles.closest_point(corners, there), axis=1)
-    # Of a sliver it may answer with a place that is not the nearest; there an edge is.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = np.linalg.norm(there - trimesh.triangles.closest_point(corners, there), axis=1)
+    # Of a sliver it may answer with a place that is not the nearest, or with none; there an edge is.
     along, away = np.roll(corners, -1, axis=1) - corners, there[:, None] - corners
     length = (along**2).sum(axis=2)
     share = np.clip((away * along).sum(axis=2) / np.where(length > 0, length, 1.0), 0.0, 1.0)
     edge = np.linalg.norm(away - share[..., None] * along, axis=2).min(axis=1)
-    return size * np.where(edge < (1 - 1e-9) * distance, edge, distance)
+    return size * np.where((1 - 1e-9) * distance <= edge, distance, edge)
 
 
 def _farthest_outside(solid: Mesh, inside: Mesh, points: NDArray, rng: np.random.Generator) -> float:
