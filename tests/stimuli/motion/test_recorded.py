@@ -392,6 +392,19 @@ def test_short_gaps_are_filled_and_named_and_long_ones_refused(tmp_path, caplog)
     assert _played(tmp_path / "b.csv", points, PlayOptions(longest_gap=0.1)).turns.shape == (1, 200, 3)
 
 
+def test_frames_that_a_table_leaves_out_are_gaps(tmp_path):
+    pixels = _filmed() / SCALE * [1, -1] + [300, 400]
+    path = _write_deeplabcut(tmp_path / "a", pixels)
+    whole = load_tracks(path, {"RC2": ""}, TRACK, EXACT)
+    head, rows = path.read_text().splitlines()[:3], path.read_text().splitlines()[3:]
+    # Ten times two frames: 40 ms would be lost of a whisk of 167 ms.
+    path.write_text("\n".join([*head, *(row for frame, row in enumerate(rows) if frame % 20 not in (10, 11))]) + "\n")
+    cut = load_tracks(path, {"RC2": ""}, TRACK, EXACT)
+    assert cut.end == pytest.approx(whole.end)
+    np.testing.assert_allclose(np.diff(cut.turns[0, :, 0]), np.diff(whole.turns[0, :, 0]), atol=0.01)
+    np.testing.assert_allclose(np.ptp(cut.turns[0, :, 0] - whole.turns[0, :, 0]), 0, atol=0.01)
+
+
 def test_the_filter_takes_the_noise_and_leaves_the_whisk(tmp_path):
     noise = np.random.default_rng(0).normal(scale=0.02, size=len(TIMES))
     smooth = _played(tmp_path / "a.csv", _filmed(angles=SWING + noise), PlayOptions()).turns[0, :, 0]
@@ -432,6 +445,21 @@ def test_angles_that_are_missing_at_an_end_are_no_gap(tmp_path, lost, words):
     angles[slice(*lost)] = np.nan
     with pytest.raises(DataError, match=f"lacks a whisker at its {words}"):
         load_angles(write_angles(tmp_path / "angles.csv", times, angles), EXACT)
+
+
+@pytest.mark.parametrize(("rate", "digits"), [(300, 5), (90, 4), (240, 5)])
+def test_times_that_a_table_rounds_run_no_faster(tmp_path, rate, digits):
+    times = np.arange(10 * rate) / rate
+    degrees = 20 * np.sin(2 * np.pi * 8 * times)
+    tracked = load_angles(write_angles(tmp_path / "angles.csv", times.round(digits), degrees), EXACT)
+    angles = tracked.angles(ARRAY["RC2"], times[:-1])[:, 0] - ARRAY["RC2"].angles[0]
+    np.testing.assert_allclose(np.degrees(angles), degrees[:-1], atol=0.05)
+
+
+def test_a_table_of_angles_without_a_row_is_refused(tmp_path):
+    times = np.delete(np.arange(50) * 0.002, 30)
+    with pytest.raises(DataError, match="evenly spaced seconds"):
+        load_angles(write_angles(tmp_path / "angles.csv", times, np.zeros(49)), EXACT)
 
 
 def test_angles_before_a_scene_begins_are_one_sentence(tmp_path):
