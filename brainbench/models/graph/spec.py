@@ -58,6 +58,8 @@ class Convolution(Operation):
     def __post_init__(self) -> None:
         if not isinstance(self.padding, str):  # an array would be compared entry by entry
             object.__setattr__(self, "padding", tuple(map(int, self.padding)))
+        elif self.padding == "same" and tuple(self.stride) != (1, 1):
+            raise UsageError(f"Padding 'same' keeps the grid and needs stride 1; received {list(self.stride)}.")
 
     def output_shape(self, shape: Shape) -> Shape:
         """Return (C, H, W) for an input (C, H, W)."""

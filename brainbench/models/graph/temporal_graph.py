@@ -441,7 +441,7 @@ class UnrolledSweep:
         self.batch = len(x)
         self.delay = graph.spec.delays(unroll)
         # Dropout gives every stimulus its own mask, so no step can be computed once and shared.
-        random = graph.training and any(node.dropout.p > 0 for _, node in graph.named_nodes())
+        random = graph.training and any(isinstance(part, nn.Dropout) and part.p > 0 for part in graph.modules())
         self.arrival = dict.fromkeys(graph.layers, 0) if random else graph.spec.first_response(unroll)
         self.kept: dict[str, tuple[int, torch.Tensor]] = {}
 

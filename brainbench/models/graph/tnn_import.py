@@ -166,8 +166,6 @@ def _operation(part: _Section) -> Convolution | Dense | None:
         padding = part.size("padding", 0, Literal["same", "valid"] | _Margins)
         part.only(dilation=1, groups=1, padding_mode="zeros")
         operation = Convolution(channels, part.size("ksize"), part.size("stride", 1), padding, **common)
-        if operation.padding == "same" and operation.stride != (1, 1):
-            raise DataError(f"Padding 'same' in {part.where} needs stride 1; found {list(operation.stride)}.")
     part.done(*_OVERWRITTEN)
     return operation
 

@@ -52,6 +52,7 @@ def test_a_wrong_graph_is_answered_in_one_sentence(edges, changes, message):
         (lambda: Convolution(3, padding="sam"), "padding of a convolution 'sam'; did you mean 'same'"),
         (lambda: Convolution(3, (0, 2)), "kernel_size of a convolution .*at least 1; received 0"),
         (lambda: Convolution(3, stride=(1, 1.5)), "stride of a convolution .*whole number.*received 1.5"),
+        (lambda: Convolution(3, stride=(2, 1)), r"'same' keeps the grid and needs stride 1; received \[2, 1\]"),
         (lambda: Pool("max", (2, 2), padding=(0, -1)), "padding of a pool .*received -1"),
         (lambda: Pool("average", 6), "size of a pool holds 2 numbers; received 6"),
         (lambda: Pool("mean", (2, 2)), "kind of a pool 'mean'.*'max', 'average'"),

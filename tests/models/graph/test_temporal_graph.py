@@ -88,6 +88,16 @@ def test_a_node_that_draws_random_numbers_draws_them_for_every_stimulus():
     assert not torch.equal(y[0], y[1])
 
 
+def test_a_chain_that_draws_random_numbers_draws_them_for_every_stimulus():
+    nodes = Node("a", Convolution(4)), Node("b", Convolution(4), chain=(Convolution(4, dropout=0.5, bias=1.0),))
+    edges = Edge("a", "b"), Edge("b", "a", feedback=True)
+    graph = TemporalGraph(GraphSpec(nodes, edges, ("a",), "b", (2, 5, 7))).train()
+    graph.node("b").operation.bias.data.fill_(1.0)
+    with torch.no_grad():
+        silent = graph(torch.zeros(4, 1, 2, 5, 7))[:, 0]
+    assert not torch.equal(silent[0], silent[1])
+
+
 def test_what_no_answer_reads_is_left_out():
     spec = zhuang_graph("intersection")
     steps = needed_steps(spec, "biological", 22, whole=(), last=("fc8",))

@@ -117,7 +117,7 @@ def test_an_unsupported_node_is_refused_in_one_sentence(change, message):
         ("dilation", 2, "'dilation': 2"),
         ("ksize", "3", r"'ksize' .*'a' .*'3'"),
         ("padding", "reflect", "Unknown 'padding' in the pre-memory of 'a' 'reflect'"),
-        ("stride", 2, "'same' in the pre-memory of 'a' needs stride 1"),
+        ("stride", 2, "'same' keeps the grid and needs stride 1"),
         ("init_dict", {"method": "kaiming"}, "'kaiming'; did you mean 'kaiming_normal_'"),
         ("colour", 1, "unsupported key 'colour' in the pre-memory of 'a'"),
     ],
