@@ -67,7 +67,7 @@ def _trained(config: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     parts += [f"{key} {config[key]}" for key in ("augmentation", "seed") if config.get(key) is not None]
     yield "weights", ", ".join(parts)
     if evaluation := config.get("evaluation"):
-        yield "accuracy (top-1)", _accuracy(evaluation)
+        yield "accuracy (top-1)", _accuracy(evaluation, config.get("evaluated_split"))
         others = dict(config.get("baselines") or {}) | {"untrained twin": config.get("twin_evaluation")}
         readouts = [f"{key.replace('-', ' ')} {item['top1']:.1%}" for key, item in others.items() if item]
         if readouts:
@@ -78,10 +78,11 @@ def _trained(config: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         yield "licence of weights", str(config["licence"])
 
 
-def _accuracy(evaluation: Mapping[str, Any]) -> str:
+def _accuracy(evaluation: Mapping[str, Any], split: str | None) -> str:
     span = evaluation.get("interval") or {}
     bounds = f" [{span['low']:.1%}, {span['high']:.1%}]" if {"low", "high"} <= span.keys() else ""
-    count = f", {evaluation['count']:,} sweeps that were held out" if evaluation.get("count") else ""
+    sweeps = f"{split} sweeps, which chose the weights" if split else "sweeps that were held out"
+    count = f", {evaluation['count']:,} {sweeps}" if evaluation.get("count") else ""
     return f"{evaluation['top1']:.1%}{bounds}{count}{', collapsed to one class' if evaluation.get('collapsed') else ''}"
 
 

@@ -1,12 +1,17 @@
 from __future__ import annotations
 
 import json
+import shutil
+from pathlib import Path
 
 import torch
 
+from brainbench import models
 from brainbench.models import registry
 from brainbench.models.registry import load_model
 from tests.factories.published_files import lightning_state
+
+WEIGHTS = Path(models.__path__[0]) / "weights"
 
 
 def test_a_card_says_what_the_weights_are(run):
@@ -19,6 +24,17 @@ def test_a_card_says_what_the_weights_are(run):
     assert plain["trained_as"] == ["zhuang-small.simclr", "zhuang-small.supervised"]
     assert "trained as " + ", ".join(plain["trained_as"]) in shown("zhuang-small")
     assert "brainbench train zhuang-gru --objective simclr" in shown("zhuang-gru.simclr")
+
+
+def test_an_accuracy_names_its_sweeps_where_they_chose_the_weights(run, tmp_path):
+    folder = shutil.copytree(WEIGHTS / "zhuang-small.simclr", tmp_path / "weights")
+    config = json.loads((folder / "config.json").read_text())
+    for split, words in (
+        (None, "sweeps that were held out"),
+        ("validation", "validation sweeps, which chose the weights"),
+    ):
+        (folder / "config.json").write_text(json.dumps(config | ({"evaluated_split": split} if split else {})))
+        assert words in " ".join(run("models", "show", f"local-dir:{folder}").out.split())
 
 
 def test_models_are_listed_with_size_cost_and_published_objectives(run):

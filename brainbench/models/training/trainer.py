@@ -332,6 +332,7 @@ class _Run:
             self.controls = _evaluations(document.get("controls") or {})
             done = document.get("evaluation")
             if done is not None:
+                self.where.wait()
                 return self._result("finished", "", Evaluation.from_plain(done))
             # The best weights as they were published, so that what is evaluated is what is shipped.
             if not (self.out / BEST / WEIGHTS).is_file():
