@@ -21,11 +21,13 @@ def test_presets_are_on_record_as_accurate_as_they_promise():
 
 
 TAILS = {
-    "fast": (0.035, 0.26, 1.81),
+    "fast": (0.037, 0.37, None),
     "balanced": (0.014, 0.15, 0.42),
     "accurate": (0.0075, 0.046, 0.33),
 }
-"""Errors between objects, on slipping off and on release as the documentation says: median, 90 %, worst."""
+"""Errors between objects, on slipping off and on release as the documentation says: median, 90 %, worst.
+
+None: one of them is unstable."""
 
 
 def test_tails_of_presets_are_on_record_as_the_documentation_says():
@@ -33,7 +35,8 @@ def test_tails_of_presets_are_on_record_as_the_documentation_says():
     points = {_setting(point): point for point in json.loads(text)["points"] if not point.get("collision")}
     for preset, tails in TAILS.items():
         point = points["rod", Fidelity.preset(preset)]
-        assert [point[f"hard_{name}"] for name in ("50", "90", "worst")] == pytest.approx(tails, rel=0.05)
+        expected = [tail and pytest.approx(tail, rel=0.05) for tail in tails]
+        assert [point[f"hard_{name}"] for name in ("50", "90", "worst")] == expected
         assert point["error_50"] < point["hard_50"]
 
 
