@@ -28,9 +28,10 @@ def _unroll(cell, xs):
     ],
 )
 def test_a_cell_equals_pytorchtnn(reference, name, cell):
-    data = np.load(reference / "tnn" / "cells.npz")
+    with np.load(reference / "tnn" / "cells.npz") as stored:
+        data = dict(stored)
     prefix = f"{name}/w/"
-    cell.load_tnn_state({key.removeprefix(prefix): data[key] for key in data.files if key.startswith(prefix)})
+    cell.load_tnn_state({key.removeprefix(prefix): data[key] for key in data if key.startswith(prefix)})
     with torch.no_grad():
         outputs, state = _unroll(cell, torch.from_numpy(data[f"{name}/x"]))
     np.testing.assert_allclose(outputs, data[f"{name}/y"], atol=1e-5)

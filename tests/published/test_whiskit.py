@@ -216,7 +216,8 @@ def _dynamics(rows=110, seed=0, whiskers=2):
 @pytest.mark.shared
 def test_the_cleaned_reference_run_is_the_published_sweep_to_the_bit(reference):
     (folder,) = find_runs(reference / "published" / "whiskit_run")
-    data = np.load(reference / "published" / "sweep_example_110hz.npz")["data"]
+    with np.load(reference / "published" / "sweep_example_110hz.npz") as stored:
+        data = stored["data"]
     expected = np.delete(data, [5, 6, 12, 13, 34], axis=1)
     np.testing.assert_array_equal(published_cleaning(read_run(folder).dynamics), expected)
     found = read_runs([folder], cleaning="published")

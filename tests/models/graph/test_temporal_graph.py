@@ -130,11 +130,12 @@ def test_a_sweep_shorter_than_the_latency_reaches_nothing():
 
 @pytest.fixture
 def published(reference):
-    return np.load(reference / "tnn" / "minizhuang_ugrnn.npz")
+    with np.load(reference / "tnn" / "minizhuang_ugrnn.npz") as stored:
+        return dict(stored)
 
 
 def _weights(data):
-    return {key.removeprefix("w/"): data[key] for key in data.files if key.startswith("w/")}
+    return {key.removeprefix("w/"): data[key] for key in data if key.startswith("w/")}
 
 
 def _loaded(data, **options):
