@@ -233,7 +233,7 @@ def conclusions(board: Board) -> list[str]:
         sentences.append(f"Told apart above {RAW_INPUT}: {len(above)} of {plural(len(tested), 'model')}{who}.")
     if chance := sum(entry.standing == "not told apart from chance" for entry in here):
         passing = ranking.CHANCE_LEVEL * len(here)
-        alone = f" Each is tested alone: about {passing:.0f} of as many unrelated ones pass." * (passing >= 1)
+        alone = f" Each is tested alone: about {passing:.0f} of as many unrelated ones pass." if passing >= 1 else ""
         sentences.append(f"Not told apart from chance: {chance} of {plural(len(here), 'model')}.{alone}")
     if apart := len(board.entries) - len(here):
         sentences.append(

@@ -569,8 +569,8 @@ def find_cheapest(
     check_number("The wanted rate", wanted, above=0, below=1)
     pool = len(candidates[0].stimuli)
     sizes = [size for size in STIMULI if size < pool] + [pool]
-    every = product(ANIMALS, UNITS, TRIALS, sizes)
-    grid = sorted((a * trials * stimuli, units, a, (a, units, trials, stimuli)) for a, units, trials, stimuli in every)
+    # By trials of all animals together, then units, then animals.
+    grid = sorted(product(ANIMALS, UNITS, TRIALS, sizes), key=lambda of: (of[0] * of[2] * of[3], of[1], of[0]))
     tried: list[TriedDesign] = []
     failed: list[tuple[int, ...]] = []
 
@@ -583,7 +583,7 @@ def find_cheapest(
         interval = wilson_interval(won, len(results), over="boards")
         return TriedDesign(animals, units, trials, stimuli, won / len(results), interval)
 
-    for *_, numbers in track(grid, "trying designs", progress):
+    for numbers in track(grid, "trying designs", progress):
         if any(all(mine <= other for mine, other in zip(numbers, one, strict=True)) for one in failed):
             continue
         attempt = measured(*numbers, boards=boards, first=0)
